@@ -36,12 +36,12 @@ from gs2d.contrib.lab.lab_options import BlocksOptions
 from gs2d.contrib.lab.merged import MERGED
 from gs2d.contrib.lab.partition import make_partition
 from gs2d.contrib.lab.split import read_split
+from gs2d.contrib.lab.surface_score import evaluate_surface
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
 from gs2d.errors import Gs2dError
-from gs2d.evaluation.surface_score import evaluate_surface
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS
 from gs2d.io.splat_ply import read_splats

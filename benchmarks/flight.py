@@ -13,13 +13,13 @@ from PIL import Image
 
 from benchmarks.flight_files import flight_exif, write_model
 from benchmarks.land import TILE, Land, build_land, shade
+from gs2d.contrib.demo.textures import linear_to_srgb
 from gs2d.core.atomic_files import disk_error
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import Hits, cast_camera
-from gs2d.synthetic.textures import linear_to_srgb
 
 HEIGHT = 80.0  # m, flight altitude above the mean ground height
 ANGLE = np.radians(60.0)  # horizontal field of view

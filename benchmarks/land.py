@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from gs2d.synthetic.shapes import merge_vertices
-from gs2d.synthetic.textures import noise, srgb_to_linear
+from gs2d.contrib.demo.shapes import merge_vertices
+from gs2d.contrib.demo.textures import noise, srgb_to_linear
 
 STEP = 4.0  # m, between ground vertices
 TILE = 32.0  # m, side of a triangle list tile; a multiple of the step

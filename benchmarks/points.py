@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gs2d.contrib.lab.surface_score import distances_to_mesh
 from gs2d.data.scene import Scene
-from gs2d.evaluation.surface_score import distances_to_mesh
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.prepare.loaded import reload_run

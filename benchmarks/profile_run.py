@@ -30,14 +30,15 @@ import torch
 from benchmarks.run_phases import LOOP, RUN_PHASES
 from benchmarks.sampler import Rule, Sampler, Seconds
 from benchmarks.timing import machine, peak_probe
+from gs2d.contrib.demo.demo_command import DemoOptions
+from gs2d.contrib.demo.run_demo import SCHEDULE_SCALE, demo
 from gs2d.kernels.library import load
-from gs2d.pipeline.demo import SCHEDULE_SCALE, demo
-from gs2d.pipeline.prepare.options import DemoOptions, TrainOptions
+from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 
 PHASES = (
     *RUN_PHASES,
-    Rule("photograph the demo scene", (("synthetic/demo_capture.py", "write_demo_capture"),)),
+    Rule("photograph the demo scene", (("demo/demo_capture.py", "write_demo_capture"),)),
     Rule("evaluate", (("pipeline/finish/evaluate.py", "evaluate_run"),)),
 )
 PARTS = (
@@ -64,7 +65,7 @@ PARTS = (
     Rule("marching cubes", (("meshing/marching_cubes.py", ""),)),
     Rule(
         "surface score",
-        (("evaluation/surface_score.py", ""), ("evaluation/visibility.py", "")),
+        (("lab/surface_score.py", ""), ("lab/visibility.py", "")),
     ),
     Rule("neighbours", (("gs2d/core/transforms.py", "nearest_distances"),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),

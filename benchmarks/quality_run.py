@@ -189,14 +189,14 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
 
 def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return the mesh quality and the meshing seconds, if there is a true surface."""
-    from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface
-    from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
+    from gs2d.contrib.lab.surface_protocols import VISIBLE_SURFACE
+    from gs2d.evaluation.evaluators import GENERAL, choose_truth, score_surface
     from gs2d.pipeline.in_memory import Trained, extract_mesh
 
     given = None if spec["ground_truth"] is None else Path(spec["ground_truth"])
     root = job.scene.root or Path(".")
     truth = choose_truth(given, root, lambda text: None)
-    if truth is None or truth.name != VISIBLE:  # official metrics have no F-score at a fraction of the size
+    if truth is None or truth.name != GENERAL:  # official metrics have no F-score at a fraction of the size
         return {"surface": None}
     start = time.process_time()
     scene = LearnedTable(job.recipe, job.scene).scene_now(state.learned)

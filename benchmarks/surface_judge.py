@@ -16,12 +16,12 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from gs2d.contrib.lab.surface_score import face_areas, nearest_on_mesh, sample_surface
+from gs2d.contrib.lab.visibility import NEAR, shown_points
 from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluation.surface_score import face_areas, nearest_on_mesh, sample_surface
-from gs2d.evaluation.visibility import NEAR, shown_points
 from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import cast_camera
 

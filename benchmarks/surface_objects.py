@@ -9,8 +9,8 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import map_coordinates
 
-from gs2d.synthetic import shapes, textures
-from gs2d.synthetic.shapes import Patch
+from gs2d.contrib.demo import shapes, textures
+from gs2d.contrib.demo.shapes import Patch
 
 Color = tuple[float, float, float]
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]  # points [n, 3], uvs [n, 2] -> sRGB colours [n, 3]

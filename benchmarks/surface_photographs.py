@@ -20,17 +20,17 @@ from scipy.spatial.transform import Rotation
 from benchmarks.surface_judge import PHOTOS, SCENE, TRUE_POINTS, TRUTH, SceneFacts, true_points, unproject
 from benchmarks.surface_objects import Part
 from benchmarks.surface_scenes import SCENES, Design, Environment
+from gs2d.contrib.demo import shapes
+from gs2d.contrib.demo.perturb_exposure import random_gains
+from gs2d.contrib.demo.perturb_poses import disturbed
+from gs2d.contrib.demo.shading import LAMP, BakedLight, bake, sky_radiance
+from gs2d.contrib.demo.textures import linear_to_srgb, srgb_to_linear
+from gs2d.contrib.lab.visibility import shown_points
 from gs2d.core.camera import Camera
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
-from gs2d.evaluation.visibility import shown_points
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import Hits, cast_camera
-from gs2d.synthetic import shapes
-from gs2d.synthetic.perturb_exposure import random_gains
-from gs2d.synthetic.perturb_poses import disturbed
-from gs2d.synthetic.shading import LAMP, BakedLight, bake, sky_radiance
-from gs2d.synthetic.textures import linear_to_srgb, srgb_to_linear
 
 TEST_EVERY = 8  # as `gs2d train` splits captures by default
 SAMPLES = 2  # rays per pixel along each axis

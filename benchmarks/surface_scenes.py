@@ -9,10 +9,10 @@ import numpy as np
 
 from benchmarks import surface_objects as things
 from benchmarks.surface_objects import Material, Noise, Part
+from gs2d.contrib.demo import shapes, textures
+from gs2d.contrib.demo.shading import LAMP, sky_radiance
+from gs2d.contrib.demo.textures import srgb_to_linear
 from gs2d.core.camera import Camera, look_at
-from gs2d.synthetic import shapes, textures
-from gs2d.synthetic.shading import LAMP, sky_radiance
-from gs2d.synthetic.textures import srgb_to_linear
 
 ASPECT = 0.75  # height of a photograph, of its width
 

@@ -59,13 +59,13 @@ from benchmarks.timing import machine
 from gs2d.config.presets import get_recipe
 from gs2d.config.schedule import MAX_SCALE, scale_schedule
 from gs2d.config.serialize import to_json
+from gs2d.contrib.demo.demo_capture import write_demo_capture
 from gs2d.core.json_files import write_json
 from gs2d.data import Scene
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, Gs2dError
 from gs2d.evaluation.evaluators import choose_truth
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
-from gs2d.synthetic.demo_capture import write_demo_capture
 from gs2d.training.events import ignore
 
 DEMO, PEER = "demo", "opensplat"

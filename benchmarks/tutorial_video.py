@@ -3,7 +3,7 @@
     python -m benchmarks.tutorial_video still_life.mp4          # needs ffmpeg
 
 The camera moves around the table twice, higher the second time, with small hand motions. No real photographs are
-needed, and the ground truth is known (`gs2d.synthetic`).
+needed, and the ground truth is known (`gs2d.contrib.demo`).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from gs2d.contrib.demo.demo_capture import CAMERA_ANGLE_X, render_image
+from gs2d.contrib.demo.demo_scene import build_scene
+from gs2d.contrib.demo.shading import bake
 from gs2d.core.camera import Camera, look_at
 from gs2d.data.image_files import write_image
-from gs2d.synthetic.demo_capture import CAMERA_ANGLE_X, render_image
-from gs2d.synthetic.demo_scene import build_scene
-from gs2d.synthetic.shading import bake
 
 ROUNDS, ELEVATIONS = 2, (16.0, 46.0)  # degrees
 WALL = np.array([196, 203, 208], dtype=np.float64)  # background behind the table, sRGB

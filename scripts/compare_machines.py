@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 import gs2d
+from gs2d.contrib.demo.demo_capture import write_demo_capture
 from gs2d.core.splats import ATTRIBUTES
-from gs2d.synthetic.demo_capture import write_demo_capture
 
 SPLATS, WIDTH, HEIGHT = 30_000, 240, 180
 VIEWS, SIZE, SCHEDULE = 10, 64, 0.005

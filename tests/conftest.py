@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from gs2d.contrib.demo import demo_capture
+from gs2d.contrib.demo.shapes import Patch
 from gs2d.errors import BackendError
 from gs2d.kernels.library import load
 from gs2d.report import first_screen, plots
-from gs2d.synthetic import demo_capture
-from gs2d.synthetic.shapes import Patch
 
 PICTURES_MATTER = ("report", "contrib/lab/test_figures.py")
-DEMO_IS_TESTED = ("synthetic",)
+DEMO_IS_TESTED = ("contrib/demo",)
 
 
 def pytest_collection_finish() -> None:

@@ -34,7 +34,6 @@ FLOORS = {
     "sfm": 4,
     "evaluation": 5,
     "report": 5,
-    "synthetic": 5,
     "training": 5,
     "viewer": 5,
     "pipeline": 6,
@@ -71,7 +70,7 @@ INSIDE = {
     },
     "pipeline": {
         "file_mesh": 7,
-        "demo in_memory reconstruct": 6,
+        "in_memory reconstruct": 6,
         "train": 5,
         "finish": 4,
         "look": 3,

@@ -14,7 +14,7 @@ from benchmarks import quality_run, time_to_quality
 from benchmarks.street_runs import Process
 from PIL import Image
 
-from gs2d.synthetic.demo_capture import write_demo_capture
+from gs2d.contrib.demo.demo_capture import write_demo_capture
 
 
 @pytest.fixture(scope="module")

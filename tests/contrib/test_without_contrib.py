@@ -45,6 +45,7 @@ def test_the_core_trains_and_exports_without_contrib(tmp_path: Path) -> None:
     listed = run("--help").stdout
     assert "reconstruct" in listed
     assert "survey" not in listed
+    assert "demo" not in listed
     capture = write_capture(tmp_path / "ball")
     few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page", "--recipe", "2dgs")
     run("train", capture, "--out", tmp_path / "run", *few)

@@ -263,7 +263,7 @@ def _pyramid(root: Path, order: str, ragged: bool) -> None:
 
 def read_surface(root: Path) -> None:
     """As `gs2d info` and `gs2d evaluate --mesh-gt` do."""
-    from gs2d.evaluation.evaluators import read_truth
+    from gs2d.contrib.lab.visible_surface import read_truth
     from gs2d.io.meshes import FOREIGN, read_mesh, read_points
     from gs2d.pipeline.look.info import describe_file
 

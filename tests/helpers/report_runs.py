@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.contrib.demo.shapes import torus_knot, tube
 from gs2d.core.camera import look_at
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
@@ -15,7 +16,6 @@ from gs2d.data.image_files import write_image
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
 from gs2d.report.color_maps import depth_image, error_image, highlight_image, normal_image
-from gs2d.synthetic.shapes import torus_knot, tube
 
 STAGES = (("surface", 3000), ("appearance", 1000), ("refine", 2000))
 KNOT = tube(torus_knot(0.6, 0.25, steps=120), 0.16, around=14, closed=True)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from gs2d.contrib.lab.surface_score import evaluate_surface
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
-from gs2d.evaluation.surface_score import evaluate_surface
 from gs2d.io.meshes import read_mesh
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.extract import extract

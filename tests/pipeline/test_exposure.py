@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 
 from ball_runs import SMALL, options
+from gs2d.contrib.demo import demo_capture as toy
+from gs2d.contrib.demo.demo_command import DemoOptions
+from gs2d.contrib.demo.perturb_exposure import GAINS, random_gains, with_gains
+from gs2d.contrib.demo.run_demo import demo
 from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import RunError
 from gs2d.io.run_dir import LEARNED, RunFolder
-from gs2d.pipeline.demo import demo
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.prepare.run_appearance import exposure_gain
 from gs2d.pipeline.train.train_run import train
-from gs2d.synthetic import demo_capture as toy
-from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
 from gs2d.training.events import Event, Notice, ignore
 
 EARLY = (*SMALL, "learned.exposure.start=5", "learned.exposure.rate=0.2")  # so that 60 iterations show something

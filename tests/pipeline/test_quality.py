@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import pytest
 
+from gs2d.contrib.demo.demo_command import DemoOptions
+from gs2d.contrib.demo.run_demo import demo
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.demo import DemoOptions, demo
 
 
 def _demo(tmp_path_factory: pytest.TempPathFactory, recipe: str, scale: float) -> RunFolder:

@@ -11,22 +11,23 @@ import pytest
 import torch
 
 from ball_runs import SMALL, Stop, comparable, options
+from gs2d.contrib.demo import demo_capture as toy
+from gs2d.contrib.demo.demo_command import DemoOptions
+from gs2d.contrib.demo.perturb_poses import TRUTH
+from gs2d.contrib.demo.run_demo import demo
 from gs2d.core.transforms import perturb_pose
 from gs2d.data import load_scene
 from gs2d.errors import RunError
 from gs2d.evaluation.image_metrics import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
-from gs2d.pipeline.demo import demo
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.prepare.run_poses import aligned, camera_motion
 from gs2d.pipeline.train.train_run import train
-from gs2d.synthetic import demo_capture as toy
-from gs2d.synthetic.perturb_poses import TRUTH
 from gs2d.training.events import Event, Notice, Step, ignore
 
 EARLY = (*SMALL, "learned.poses.start=5", "learned.poses.rate=0.01")  # so that 60 iterations show something

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.evaluation.surface_score import evaluate_surface
+from gs2d.contrib.lab.surface_score import evaluate_surface
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
@@ -21,7 +21,7 @@ from tiny import write_ball_mesh
 @pytest.fixture
 def beside(undisturbed: RunFolder, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
     """A copy of the run whose capture has a true mesh; and that capture."""
-    monkeypatch.setattr("gs2d.evaluation.evaluators.evaluate_surface", partial(evaluate_surface, samples=2000))
+    monkeypatch.setattr("gs2d.contrib.lab.visible_surface.evaluate_surface", partial(evaluate_surface, samples=2000))
     run, folder = tmp_path / "run", tmp_path / "ball"
     shutil.copytree(undisturbed.path, run)
     shutil.copytree(capture, folder)

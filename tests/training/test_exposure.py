@@ -15,6 +15,7 @@ from gs2d.config.presets import appearance, refine, surface, with_exposure
 from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC
 from gs2d.config.quantities import EXPOSURE, Quantity
 from gs2d.config.recipe import LearningRates, Recipe
+from gs2d.contrib.demo.perturb_exposure import random_gains
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
@@ -22,7 +23,6 @@ from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.exposure_transform import _gradients
 from gs2d.render.types import RasterSettings
-from gs2d.synthetic.perturb_exposure import random_gains
 from gs2d.training import events
 from gs2d.training.cached_objective import CachedViews
 from gs2d.training.learned.appearance import shown, shown_splats

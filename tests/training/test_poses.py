@@ -12,12 +12,12 @@ from gs2d.config.presets import appearance, surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.quantities import POSES
 from gs2d.config.recipe import LearningRates, Recipe
+from gs2d.contrib.demo.perturb_poses import disturbed
 from gs2d.core.camera import look_at
 from gs2d.core.transforms import common_motion, perturb_pose, se3_exp, similarity_motions
 from gs2d.data.scene import Scene
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.synthetic.perturb_poses import disturbed
 from gs2d.training.cached_objective import CachedViews
 from gs2d.training.learned.camera_pose import CameraPose
 from gs2d.training.objective import Rendered

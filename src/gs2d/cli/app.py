@@ -24,7 +24,6 @@ from gs2d.cli.command_line import NAMES
 from gs2d.cli.command_registry import COMMANDS
 from gs2d.cli.commands import (
     Common,
-    DemoCommand,
     DoctorCommand,
     InfoCommand,
     RecipesCommand,
@@ -38,6 +37,7 @@ from gs2d.core.memory_limit import address_space, check_address_space
 from gs2d.core.processes import process_rank
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
+from gs2d.pipeline.prepare.options import HowItRuns
 
 OK, EXIT_BUG, EXIT_USAGE, INCOMPLETE, PIPE_CLOSED = 0, 1, 2, 3, 141
 _USER_ERRORS = frozenset(
@@ -220,7 +220,7 @@ def _resumed(argv: Sequence[str]) -> str:
 def _interrupted(argv: Sequence[str], command: Common) -> int:
     """Print what is kept of an interrupted command and how to continue it."""
     line = "interrupted"
-    if isinstance(command, TrainCommand | DemoCommand | ReconstructCommand):
+    if isinstance(command, HowItRuns):
         is_training = any((command.out / "checkpoints").glob("*.pt"))
         if is_training or isinstance(command, ReconstructCommand):  # which can always resume
             line += f"; {'' if is_training else _kept_cameras(command)}resume with: {_resumed(argv)}"
@@ -230,7 +230,7 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
     return INTERRUPTED
 
 
-def _kept_cameras(command: TrainCommand | DemoCommand | ReconstructCommand) -> str:
+def _kept_cameras(command: HowItRuns) -> str:
     """Return what an interrupted ``gs2d reconstruct`` keeps before training, in words."""
     from gs2d.sfm.search import SEARCH
     from gs2d.sfm.workspace import hidden_workspace

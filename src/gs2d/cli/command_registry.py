@@ -47,7 +47,7 @@ class Command:
 
 
 _CORE = (
-    *("doctor", "demo", "reconstruct", "view", "poses", "train", "mesh"),
+    *("doctor", "reconstruct", "view", "poses", "train", "mesh"),
     *("info", "render", "export", "evaluate", "recipes"),
 )
 COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE, "gs2d.cli.commands"))

@@ -11,7 +11,6 @@ from gs2d.cli.command_registry import BEGIN, LOOK, MEASURE, STEPS, register_comm
 from gs2d.config.arguments import SETTING, Arg
 from gs2d.pipeline.prepare.options import (
     BoxOption,
-    DemoOptions,
     EvaluateOptions,
     MeshOptions,
     Overrides,
@@ -42,17 +41,6 @@ class Common:
     def after_interrupt(self, words: Sequence[str]) -> str:
         """Return what to say after Ctrl-C, beyond "interrupted"; ``words`` is the command line."""
         return ""
-
-
-@register_command(
-    "demo",
-    action="gs2d.cli.handlers:demo",
-    group=BEGIN,
-    first=("out", "schedule_scale", "viewer", "resume", "overwrite"),
-)
-@dataclass(frozen=True, kw_only=True)
-class DemoCommand(DemoOptions, Common):
-    """Render a small synthetic capture, train on it and score the result."""
 
 
 @register_command(

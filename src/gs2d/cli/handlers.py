@@ -48,15 +48,6 @@ def _estimate(command: c.TrainCommand, console: Console) -> None:
     console.result(asdict(estimate))
 
 
-def demo(command: c.DemoCommand, console: Console) -> None:
-    """``gs2d demo``."""
-    from gs2d.pipeline.demo import demo as run_demo
-
-    run = run_demo(command, console.on_event)
-    console.close()
-    show_run(run.path, run.metrics(), console)
-
-
 def mesh(command: c.MeshCommand, console: Console) -> None:
     """``gs2d mesh``."""
     from gs2d.pipeline.finish.run_mesh import mesh_run

@@ -4,46 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
 from gs2d.config.registry import Register, Registry
 from gs2d.core.mesh import Mesh
-from gs2d.data.arrays import read_npy
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.evaluation.surface_score import SurfaceScore, evaluate_surface, write_clouds
-from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
-from gs2d.io.meshes import FOREIGN, read_mesh, read_points
-from gs2d.io.run_dir import make_folder
-from gs2d.io.splat_ply import ply_kind
 
 Tell = Callable[[str], None]
 
-APART = 0.05  # of the diagonal of the truth: a larger median distance suggests a wrong coordinate system
-MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # files beside a capture
-VISIBLE = "visible-surface"  # the default evaluator
-SEEN_SUFFIX = "_seen.npy"  # FILE_seen.npy beside FILE.ply: number of views that see each face
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """A true surface for the visible-surface protocol.
-
-    Attributes
-    ----------
-    path : Path
-    surface : Mesh, or ndarray [P, 3] of points
-    seen : ndarray [F] or None
-        Number of training views that see each face.
-    """
-
-    path: Path
-    surface: Mesh | np.ndarray
-    seen: np.ndarray | None
+GENERAL = "visible-surface"  # the evaluator for captures of no known data set; asked last
 
 
 class Evaluator(Protocol):
@@ -70,9 +42,7 @@ class Evaluator(Protocol):
         """
 
 
-EVALUATORS: Registry[Callable[[], Evaluator]] = Registry(
-    "evaluator", "gs2d.evaluators", builtin={VISIBLE: __name__}, error=DataError
-)
+EVALUATORS: Registry[Callable[[], Evaluator]] = Registry("evaluator", "gs2d.evaluators", error=DataError)
 """Classes of evaluators, by name."""
 
 
@@ -115,39 +85,23 @@ class FoundTruth:
     truth: Any
 
 
-def read_truth(path: Path) -> Truth:
-    """Read a ground truth: a mesh (with the counts of ``NAME_seen.npy``, if it exists) or the points of a PLY file."""
-    kind = "mesh" if path.suffix.lower() in FOREIGN else ply_kind(path)
-    if kind == "points":
-        return Truth(path, np.asarray(read_points(path).points, np.float64), None)
-    if kind != "mesh":
-        raise DataError(f"{path}: expected a mesh or points, got {kind} splats; use the true surface")
-    mesh = read_mesh(path)
-    counts = path.with_name(path.stem + SEEN_SUFFIX)
-    if not counts.exists():
-        return Truth(path, mesh, None)
-    seen = read_npy(counts, "counts of views")
-    if seen.shape != (len(mesh.faces),):
-        raise DataError(f"{counts} must hold {len(mesh.faces)} counts (faces of {path.name}), got {list(seen.shape)}")
-    return Truth(path, mesh, seen)
-
-
 def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | None:
     """Return the ground truth of a capture, from the file or folder ``given``, or beside the capture.
 
-    Evaluators of data sets come first. Other captures are compared with the mesh or points in ``given``, or with
-    ``mesh_gt.ply``, ``mesh_gt.obj`` or ``points_gt.ply`` beside the capture.
+    Evaluators of data sets come first, then the general one.
 
     Raises
     ------
     DataError
         If ``given`` contains no ground truth of this capture.
     """
-    for name, make in sorted(EVALUATORS.working(), key=lambda item: item[0] == VISIBLE):
+    for name, make in sorted(EVALUATORS.working(), key=lambda item: item[0] == GENERAL):
         evaluator = make()
         truth = evaluator.find(capture, given, tell)
         if truth is not None:
             return FoundTruth(name, evaluator, truth)
+    if given is not None:
+        raise DataError(f"no evaluator reads {given}; evaluators: {', '.join(EVALUATORS) or 'none'}")
     return None
 
 
@@ -167,69 +121,3 @@ def score_surface(
     for message in facts["self_check"]["messages"]:
         tell(message)
     return {"evaluator": found.name, **facts}
-
-
-@EVALUATORS.register(VISIBLE)
-class VisibleSurfaceEvaluator:
-    """Chamfer distance, precision, recall and F-score of a mesh, over the surface that the training views see."""
-
-    has_thresholds = True
-
-    def find(self, capture: Path, given: Path | None, tell: Tell) -> Truth | None:
-        """Return a mesh or points: the file ``given``, or one of ``MESH_TRUTHS`` in the folder."""
-        folder = given or capture
-        path = next((folder / name for name in MESH_TRUTHS if (folder / name).is_file()), None)
-        if path is not None:
-            tell(f"ground truth: {path}")
-        elif given is not None and not given.is_dir():
-            path = given
-        elif given is not None:
-            raise DataError(
-                f"{given} must contain the official ground truth of a scene of DTU or Tanks and Temples, or one of "
-                f"{', '.join(MESH_TRUTHS)}, got neither for the capture {capture.name}; use a PLY or OBJ file"
-            )
-        truth = None if path is None else read_truth(path)
-        if truth is not None and truth.seen is not None:
-            tell(f"view counts of true faces: {truth.path.stem}{SEEN_SUFFIX}")
-        return truth
-
-    def score(
-        self, mesh: Mesh, truth: Truth, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
-    ) -> dict[str, Any]:
-        """Score a mesh with the visible-surface protocol."""
-        score = evaluate_surface(
-            mesh,
-            truth.surface,
-            cameras=[view.camera for view in scene.train],
-            seen=truth.seen,
-            T_truth_mesh=scene.T_metric_scene,
-            thresholds=thresholds or None,
-        )
-        facts = asdict(replace(score, clouds=None))
-        facts.pop("clouds")
-        rows = list(facts.pop("scores"))
-        files = {}
-        if score.clouds is not None:
-            make_folder(folder)
-            files = {what: f"{folder.name}/{name}" for what, name in write_clouds(folder, score.clouds).items()}
-        is_world = np.array_equal(scene.T_metric_scene, np.eye(4))  # otherwise the scale_mat of DTU
-        return {
-            "unit": "world units" if is_world else "mm",
-            "ground_truth": str(truth.path),
-            **{name: rows[0][name] for name in ("threshold", "precision", "recall", "f_score")},
-            **facts,
-            "thresholds": rows,
-            "self_check": _self_check(score, truth),
-            "protocol": asdict(VISIBLE_SURFACE),
-            "files": files,
-        }
-
-
-def _self_check(score: SurfaceScore, truth: Truth) -> dict[str, Any]:
-    """Check that both surfaces overlap."""
-    far = score.accuracy_median is not None and score.accuracy_median > APART * score.diagonal
-    line = (
-        f"half of the mesh is more than {APART:.0%} of the size of the truth away from {truth.path.name}: check its "
-        "coordinate system and units"
-    )
-    return {"ok": not far and score.reason is None, "messages": [line] if far else []}

@@ -64,7 +64,7 @@ def train_options(options: ReconstructOptions) -> TrainOptions:
     """Return the options of ``gs2d train``."""
     shared = {name: value for kind in (Effort, HowItRuns, Resources) for name, value in values(kind, options).items()}
     training = values(Training, options.training)
-    return TrainOptions(scene=options.out / CAPTURE, out=options.out, format="colmap", **shared, **training)
+    return TrainOptions(scene=options.out / CAPTURE, format="colmap", **shared, **training)
 
 
 def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunFolder:

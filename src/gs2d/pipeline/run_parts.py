@@ -18,8 +18,3 @@ TRAINED = (
     RunPart("report", ("writing the report", "writing the page"), of_training=0.03),
 )
 TEXTURED_TOO = (*TRAINED, RunPart("texture", _TEXTURE_PHASES, of_training=0.1))
-DEMO = (
-    RunPart("photographs", ("photographing",)),
-    *TRAINED,
-    RunPart("scores", ("scoring the surface",), of_training=0.1),
-)

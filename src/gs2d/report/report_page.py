@@ -19,7 +19,7 @@ from gs2d.report.first_screen import first_screen
 from gs2d.report.html_parts import macro, missing, page
 from gs2d.report.part_guard import Guard, OnFailure
 from gs2d.report.run_record import RunRecord, read_record
-from gs2d.report.sections.section_registry import SECTIONS, Section
+from gs2d.report.sections.section_registry import GLOSSARY, SECTIONS, Section
 
 
 def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFailure | None = None) -> Path:
@@ -60,7 +60,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
 def _sections(record: RunRecord, guard: Guard) -> list[str]:
     """Return the sections that have something to show, folded."""
     made: list[str] = []
-    for name, section in SECTIONS.working():
+    for name, section in sorted(SECTIONS.working(), key=lambda item: item[0] == GLOSSARY):
         html = guard(f"section {name}", partial(_html, section, record))
         if html:
             shown = html if isinstance(html, Markup) else missing(html)

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from gs2d.contrib.lab.surface_score import evaluate_surface
 from gs2d.core.mesh import Mesh
 from gs2d.data import load_scene
 from gs2d.errors import DataError
-from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface
-from gs2d.evaluation.surface_score import evaluate_surface
+from gs2d.evaluation.evaluators import GENERAL, choose_truth, score_surface
 from gs2d.io.meshes import read_points, write_mesh
 from official_captures import T_MM, write_dtu_capture, write_points, write_tnt_capture
 from oracle_scenes import grid_mesh, moved
@@ -106,7 +106,7 @@ def test_a_capture_of_nobody_s_data_set_takes_the_mesh_beside_it(tmp_path: Path)
     heard: list[str] = []
     truth = choose_truth(None, root, heard.append)
     assert truth is not None
-    assert truth.name == VISIBLE
+    assert truth.name == GENERAL
     assert heard == [f"ground truth: {root / 'mesh_gt.ply'}"]
     with pytest.raises(DataError, match="got neither for the capture Shed; use a PLY or OBJ file"):
         choose_truth(tmp_path / "GT", root, ignore)
@@ -123,12 +123,12 @@ def test_the_visible_surface_has_its_headline_at_a_quarter_of_a_per_cent_of_the_
 ) -> None:
     """Squares of 2 x 2: diagonal 2.83, thresholds 0.0071, 0.0141, 0.0283; 0.01 apart is between the first two."""
     root, _, _ = write_tnt_capture(tmp_path, "Shed")
-    monkeypatch.setattr("gs2d.evaluation.evaluators.evaluate_surface", partial(evaluate_surface, samples=4000))
+    monkeypatch.setattr("gs2d.contrib.lab.visible_surface.evaluate_surface", partial(evaluate_surface, samples=4000))
     write_mesh(root / "mesh_gt.ply", flat(0.0))
     np.save(root / "mesh_gt_seen.npy", np.full(800, 9))
     truth = choose_truth(None, root, ignore)
     assert truth is not None
-    assert truth.name == VISIBLE
+    assert truth.name == GENERAL
     scene: Any = SimpleNamespace(train=(), T_metric_scene=np.eye(4))
     result = score_surface(flat(0.01), truth, scene, folder=tmp_path, tell=ignore)
     assert set(result) >= HEADLINE

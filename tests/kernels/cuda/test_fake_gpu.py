@@ -79,8 +79,8 @@ assert {"adam_step", "splat_errors", "blend_vjp_learning", "running_counts"} <= 
 
 WHOLE_PATH = """
 from functools import partial
-from gs2d.evaluation.surface_score import evaluate_surface
-from gs2d.evaluation import evaluators
+from gs2d.contrib.lab.surface_score import evaluate_surface
+from gs2d.contrib.lab import visible_surface
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_images import render_run
@@ -89,7 +89,7 @@ from gs2d.pipeline.train.train_run import train
 import tiny
 
 launched = fake_gpu.install(guard, emulator)
-evaluators.evaluate_surface = partial(evaluate_surface, samples=300)
+visible_surface.evaluate_surface = partial(evaluate_surface, samples=300)
 capture = tiny.write_capture(folder / "ball")
 tiny.write_ball_mesh(capture / "mesh_gt.ply")
 few = ("init_points=60", "surface.densify.max_splats=90")

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.contrib.lab.nearest import Cloud
 from gs2d.core.checks import check_shapes
 from gs2d.core.similarity import apply, similarity_scale, umeyama, umeyama_batch
 from gs2d.errors import DataError
-from gs2d.evaluation.nearest import Cloud
 
 # -- iterative closest points ------------------------------------------------------------------------------------------
 # Written after the definitions of Open3D (``registration_icp``, ``voxel_down_sample``, ``uniform_down_sample``), which

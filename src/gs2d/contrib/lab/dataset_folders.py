@@ -19,13 +19,13 @@ from gs2d.contrib.lab.datasets import (
     DataSet,
     SceneFacts,
 )
+from gs2d.contrib.lab.visible_surface import MESH_TRUTHS
 from gs2d.core.image_arrays import is_number
 from gs2d.core.json_files import read_json
 from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import DataError
-from gs2d.evaluation.evaluators import MESH_TRUTHS
 
 # -- missing files -----------------------------------------------------------------------------------------------------
 TRAINING, TESTING, SCORING = "for training", "for testing", "to score the surface"

@@ -21,13 +21,13 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from gs2d.contrib.lab.nearest import Cloud
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, DtuSurface
+from gs2d.contrib.lab.surface_score import ScoredClouds
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import apply, similarity_scale
 from gs2d.errors import DataError
-from gs2d.evaluation.nearest import Cloud
-from gs2d.evaluation.surface_score import ScoredClouds
 from gs2d.io.meshes import read_points
 
 

@@ -28,15 +28,15 @@ from gs2d.contrib.lab.alignment import (
     uniform_downsample,
     voxel_downsample,
 )
+from gs2d.contrib.lab.nearest import Cloud
 from gs2d.contrib.lab.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
+from gs2d.contrib.lab.surface_score import ScoredClouds
 from gs2d.core.checks import check_shapes
 from gs2d.core.image_arrays import natural_key
 from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import apply, similarity_scale
 from gs2d.errors import DataError
-from gs2d.evaluation.nearest import Cloud
-from gs2d.evaluation.surface_score import ScoredClouds
 from gs2d.io.meshes import read_points
 
 # -- the crop volume ---------------------------------------------------------------------------------------------------

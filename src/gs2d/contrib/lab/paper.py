@@ -16,13 +16,12 @@ from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOption
 from gs2d.contrib.lab.paper_tables import DTU, TNT, PaperRow, PaperTable
 from gs2d.contrib.lab.render import to_csv, to_latex, to_markdown, write_page
 from gs2d.contrib.lab.scenes import FoundScene
-from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE
+from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
 from gs2d.contrib.lab.table_plan import Plan, commands_of, make_plan, paper_command
 from gs2d.contrib.lab.tasks import failures
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
-from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
 from gs2d.io.run_dir import machine, make_folder, versions
 from gs2d.pipeline.prepare.options import values
 from gs2d.training.events import Notice, OnEvent, ignore

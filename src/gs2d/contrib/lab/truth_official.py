@@ -15,12 +15,12 @@ from gs2d.contrib.lab.dtu_reader import dtu_silhouettes
 from gs2d.contrib.lab.evaluate_dtu import ViewSilhouette, evaluate_dtu, read_dtu_truth
 from gs2d.contrib.lab.evaluate_tnt import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE
+from gs2d.contrib.lab.surface_score import write_clouds
 from gs2d.core.mesh import Mesh
 from gs2d.data.image_files import read_mask
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.evaluation.evaluators import register_evaluator
-from gs2d.evaluation.surface_score import write_clouds
 from gs2d.io.run_dir import make_folder
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from gs2d.config.arguments import PYTHON_ONLY, SETTING, Arg
+from gs2d.config.arguments import SETTING, Arg
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.protocols import Protocol
 from gs2d.config.quantities import QUANTITIES
@@ -62,8 +62,10 @@ def learned_names(learn: str | tuple[str, ...]) -> tuple[str, ...]:
 # -- shared by several commands ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class HowItRuns:
-    """How training runs: options of every command that trains."""
+    """How training runs: options of every command that trains one run."""
 
+    out: Annotated[Path, Arg(metavar="RUN")]
+    """Run folder to create."""
     backend: str = "auto"
     """Rasterizer: auto (the fastest here), cpu, cuda or reference. `gs2d doctor` lists them."""
     seed: int = 0
@@ -197,8 +199,6 @@ class TrainOptions(Training, Effort, Resources, HowItRuns):
 
     scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
     """Folder of a capture: COLMAP, Blender, nerfstudio, DTU, OpenSfM, OpenDroneMap, Metashape or Meshroom."""
-    out: Annotated[Path, Arg(metavar="RUN")]
-    """Run folder to create."""
     format: str = "auto"
     """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one of a package."""
     masks: Annotated[Path | None, Arg(metavar="DIR")] = None
@@ -248,35 +248,6 @@ class ReconstructOptions(Effort, Resources, HowItRuns):
 
     def __post_init__(self) -> None:
         paths_of(self, "photos", "out")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DemoOptions(HowItRuns):
-    """Options of the demo."""
-
-    out: Path = Path("runs/demo")
-    """Run folder; an earlier demo there is replaced."""
-    recipe: str | Recipe = DEFAULT_RECIPE
-    """Recipe. `gs2d recipes` lists them."""
-    schedule_scale: float | None = None
-    """Fraction of the iterations of the recipe (default: 0.15, two minutes on two cores)."""
-    learn: Annotated[str | tuple[str, ...], PYTHON_ONLY] = "none"
-    """As in `gs2d train`."""
-    vary_exposure: Annotated[bool, PYTHON_ONLY] = False
-    """Vary exposure and white balance of the training images."""
-    vary_poses: Annotated[bool, PYTHON_ONLY] = False
-    """Disturb the poses of the training images by half a degree and half a percent."""
-    page: bool = True
-    """Do not write scene.html, the splats as a page for any browser."""
-    viewer: ViewerOption = None
-    """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
-    train_views: Annotated[int, PYTHON_ONLY] = 40
-    test_views: Annotated[int, PYTHON_ONLY] = 8
-    size: Annotated[int, PYTHON_ONLY] = 256
-    """Width and height of the photographs, px."""
-
-    def __post_init__(self) -> None:
-        paths_of(self, "out")
 
 
 # -- commands that need a finished run ---------------------------------------------------------------------------------

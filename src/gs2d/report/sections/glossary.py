@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from gs2d.report.html_parts import macro
 from gs2d.report.run_record import RunRecord
-from gs2d.report.sections.section_registry import register_section
+from gs2d.report.sections.section_registry import GLOSSARY, register_section
 
 GENERAL = {
     "PSNR": "Peak signal-to-noise ratio in decibels: similarity of a rendering and its photograph, pixel by pixel. "
@@ -43,7 +43,7 @@ def titles_of(names: Sequence[str]) -> dict[str, str]:
     return {name: TERMS[term] for name, term in terms.items() if term in TERMS}
 
 
-@register_section("terms", title="Terms")
+@register_section(GLOSSARY, title="Terms")
 def terms_section(run: RunRecord) -> str | None:
     """Return the terms of the report with their meanings."""
     return macro("lists.html", "glossary", TERMS if run.surface else GENERAL)

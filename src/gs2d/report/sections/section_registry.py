@@ -11,8 +11,9 @@ from gs2d.report.run_record import RunRecord
 Section = Callable[[RunRecord], str | None]
 """Returns the HTML of a section, or None where it has nothing to show; its attribute `title` is the heading."""
 
+GLOSSARY = "terms"  # the last section
 _BUILTIN = (  # in the order of the page; each is a module of this package
-    *("verdict", "results", "views", "training", "surface", "capture"),
+    *("verdict", "results", "views", "training", "capture"),
     *("learned", "losses", "files", "settings"),
 )
 SECTIONS: Registry[Section] = Registry(
@@ -20,11 +21,11 @@ SECTIONS: Registry[Section] = Registry(
     "gs2d.sections",
     builtin={
         **{name: f"gs2d.report.sections.{name}_section" for name in _BUILTIN},
-        "terms": "gs2d.report.sections.glossary",
+        GLOSSARY: "gs2d.report.sections.glossary",
     },
     error=RunError,
 )
-"""Names of sections, in the order of the page; those of other packages come last."""
+"""Names of sections, in the order of the page; those of contrib and of packages follow, then the glossary."""
 
 
 def register_section(name: str, *, title: str) -> Callable[[Section], Section]:

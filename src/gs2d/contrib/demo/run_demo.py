@@ -4,24 +4,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gs2d.contrib.demo.demo_capture import VARIED, write_demo_capture
+from gs2d.contrib.demo.demo_command import DemoOptions
+from gs2d.contrib.demo.perturb_exposure import GAINS
+from gs2d.contrib.demo.perturb_poses import TRUTH as TRUE_POSES
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.prepare.limits import use_threads
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, HowItRuns, TrainOptions, learned_names, values
+from gs2d.pipeline.prepare.options import EvaluateOptions, HowItRuns, TrainOptions, learned_names, values
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.run_parts import DEMO
+from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.train_run import check_viewer, train
-from gs2d.synthetic.demo_capture import VARIED, write_demo_capture
-from gs2d.synthetic.perturb_exposure import GAINS
-from gs2d.synthetic.perturb_poses import TRUTH as TRUE_POSES
-from gs2d.training.events import OnEvent, Phase, RunPlan, Step, ignore
+from gs2d.training.events import OnEvent, Phase, RunPart, RunPlan, Step, ignore
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
 TITLE = "gs2d demo: a still life with a known surface"
 SCHEDULE_SCALE = 0.15
+PARTS = (
+    RunPart("photographs", ("photographing",)),
+    *TRAINED,
+    RunPart("scores", ("scoring the surface",), of_training=0.1),
+)
 
 
 def demo(
@@ -43,7 +49,7 @@ def demo(
     check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=(CAPTURE,))
     check_viewer(training)
     use_threads(options.threads)
-    on_event(RunPlan(DEMO))
+    on_event(RunPlan(PARTS))
     if not (options.resume and (capture / "transforms_train.json").exists()):
         _check_capture(capture)
         on_event(Phase("photographing the demo scene", options.train_views + options.test_views))
@@ -87,7 +93,6 @@ def _train_options(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
     shared = {**values(HowItRuns, options), "overwrite": overwrite}
     return TrainOptions(
         scene=options.out / CAPTURE,
-        out=options.out,
         recipe=options.recipe,
         learn=options.learn,
         viewer=options.viewer,

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.contrib.demo.demo_scene import ToyScene
+from gs2d.contrib.demo.shapes import Patch
 from gs2d.meshing.raycast import Hits, occluded
-from gs2d.synthetic.demo_scene import ToyScene
-from gs2d.synthetic.shapes import Patch
 
 LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
 _LAMP_COLOR = np.array([1.80, 1.62, 1.36])

@@ -10,6 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from gs2d.contrib.demo.demo_scene import ToyScene, build_scene
+from gs2d.contrib.demo.perturb_exposure import GAINS, random_gains, with_gains
+from gs2d.contrib.demo.perturb_poses import TRUTH, disturbed
+from gs2d.contrib.demo.shading import BakedLight, bake, shade
+from gs2d.contrib.demo.shapes import merge_vertices
+from gs2d.contrib.demo.textures import linear_to_srgb
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import write_json
@@ -18,12 +24,6 @@ from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
-from gs2d.synthetic.demo_scene import ToyScene, build_scene
-from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
-from gs2d.synthetic.perturb_poses import TRUTH, disturbed
-from gs2d.synthetic.shading import BakedLight, bake, shade
-from gs2d.synthetic.shapes import merge_vertices
-from gs2d.synthetic.textures import linear_to_srgb
 
 CAMERA_ANGLE_X = 0.6911112  # radians, the horizontal field of view of NeRF-Synthetic
 VARIED = ("exposure", "poses")

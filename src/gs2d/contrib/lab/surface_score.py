@@ -22,14 +22,14 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from gs2d.contrib.lab.nearest import Cloud
+from gs2d.contrib.lab.surface_protocols import VISIBLE_SURFACE
+from gs2d.contrib.lab.visibility import frustum_counts, visible_counts
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import similarity_scale
 from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
-from gs2d.evaluation.nearest import Cloud
-from gs2d.evaluation.visibility import frustum_counts, visible_counts
-from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
 from gs2d.io.ply_format import write_ply
 
 # -- points on surfaces, and exact distances to triangles --------------------------------------------------------------

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.synthetic import shapes, textures
+from gs2d.contrib.demo import shapes, textures
 
 FLOOR = -0.60  # world units, height of the plinth's upper face
 RADIUS = 1.08  # world units, of the plinth

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gs2d.contrib.lab.nearest import Cloud
 from gs2d.errors import DataError
-from gs2d.evaluation.nearest import Cloud
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
 

@@ -11,17 +11,17 @@ import pytest
 import torch
 import trimesh
 
-from gs2d.core.camera import Camera, look_at
-from gs2d.core.mesh import Mesh
-from gs2d.errors import DataError
-from gs2d.evaluation.surface_score import (
+from gs2d.contrib.lab.surface_score import (
     distances_to_mesh,
     evaluate_surface,
     face_areas,
     sample_surface,
     triangle_distances,
 )
-from gs2d.evaluation.visibility import visible_counts
+from gs2d.contrib.lab.visibility import visible_counts
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh
+from gs2d.errors import DataError
 from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import cast_camera
 

@@ -1,0 +1,54 @@
+"""The command ``gs2d demo`` and its options. Imports no torch, so that `--help` is instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from gs2d.cli.command_registry import BEGIN, register_command
+from gs2d.cli.commands import Common
+from gs2d.config.arguments import PYTHON_ONLY
+from gs2d.config.presets import DEFAULT_RECIPE
+from gs2d.config.recipe import Recipe
+from gs2d.pipeline.prepare.options import HowItRuns, ViewerOption, paths_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(HowItRuns):
+    """Options of the demo."""
+
+    out: Path = Path("runs/demo")
+    """Run folder; an earlier demo there is replaced."""
+    recipe: str | Recipe = DEFAULT_RECIPE
+    """Recipe. `gs2d recipes` lists them."""
+    schedule_scale: float | None = None
+    """Fraction of the iterations of the recipe (default: 0.15, two minutes on two cores)."""
+    learn: Annotated[str | tuple[str, ...], PYTHON_ONLY] = "none"
+    """As in `gs2d train`."""
+    vary_exposure: Annotated[bool, PYTHON_ONLY] = False
+    """Vary exposure and white balance of the training images."""
+    vary_poses: Annotated[bool, PYTHON_ONLY] = False
+    """Disturb the poses of the training images by half a degree and half a percent."""
+    page: bool = True
+    """Do not write scene.html, the splats as a page for any browser."""
+    viewer: ViewerOption = None
+    """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
+    train_views: Annotated[int, PYTHON_ONLY] = 40
+    test_views: Annotated[int, PYTHON_ONLY] = 8
+    size: Annotated[int, PYTHON_ONLY] = 256
+    """Width and height of the photographs, px."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "out")
+
+
+@register_command(
+    "demo",
+    action="gs2d.contrib.demo.show_demo:show_demo",
+    group=BEGIN,
+    first=("out", "schedule_scale", "viewer", "resume", "overwrite"),
+)
+@dataclass(frozen=True, kw_only=True)
+class DemoCommand(DemoOptions, Common):
+    """Render a small synthetic capture, train on it and score the result."""

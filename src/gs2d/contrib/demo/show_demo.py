@@ -1,0 +1,15 @@
+"""What ``gs2d demo`` does and prints."""
+
+from __future__ import annotations
+
+from gs2d.cli.console import Console
+from gs2d.cli.results import show_run
+from gs2d.contrib.demo.demo_command import DemoCommand
+from gs2d.contrib.demo.run_demo import demo
+
+
+def show_demo(command: DemoCommand, console: Console) -> None:
+    """Run the demo and print its results."""
+    run = demo(command, console.on_event)
+    console.close()
+    show_run(run.path, run.metrics(), console)

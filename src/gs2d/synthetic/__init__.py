@@ -1,1 +1,0 @@
-"""The capture of the demo: a rendered scene with an exactly known surface."""
