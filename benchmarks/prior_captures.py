@@ -26,9 +26,9 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import grey_dilation, grey_erosion, zoom
 
+from gs2d.contrib.capture.json_captures import read_blender
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
-from gs2d.data.readers.json_captures import read_blender
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.meshing.raycast import Hits, cast_camera
 

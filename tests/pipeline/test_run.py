@@ -13,12 +13,12 @@ import pytest
 
 from ball_runs import Stop, options
 from capture_writers import small_colmap
+from gs2d.contrib.capture.json_captures import read_blender
 from gs2d.contrib.demo.demo_command import DemoOptions
 from gs2d.contrib.demo.run_demo import demo
 from gs2d.data.build import Capture
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.capture_readers import READERS
-from gs2d.data.readers.json_captures import read_blender
 from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats

@@ -13,8 +13,7 @@ from gs2d.errors import DataError
 
 __all__ = ["READERS", "Reader", "register_reader"]
 
-_JSON = "gs2d.data.readers.json_captures"
-_CORE = {"blender": _JSON, "nerfstudio": _JSON, "colmap": "gs2d.data.readers.colmap"}
+_CORE = {"colmap": "gs2d.data.readers.colmap"}
 
 
 class Reader(Protocol):

@@ -90,6 +90,7 @@ class Blender:
     """Reader of NeRF-Synthetic captures."""
 
     looks_for = f"{TRAIN} (Blender)"
+    before_colmap = True
 
     def detect(self, path: Path) -> bool:
         """Whether the folder has ``transforms_train.json``."""
@@ -105,6 +106,7 @@ class Nerfstudio:
     """Reader of captures of nerfstudio and instant-ngp."""
 
     looks_for = f"{CAMERAS} (nerfstudio)"
+    before_colmap = True
 
     def detect(self, path: Path) -> bool:
         """Whether the folder has ``transforms.json``."""
