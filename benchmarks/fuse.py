@@ -24,6 +24,7 @@ from typing import TypeVar
 import numpy as np
 
 from benchmarks.timing import machine
+from gs2d.contrib.surfaces.unbounded import derive_cascade, find_cascade_blocks, fused_cascade_surface
 from gs2d.core.camera import Camera, look_at
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
@@ -31,7 +32,6 @@ from gs2d.meshing.evidence import gather
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
 from gs2d.meshing.tsdf_volume import VolumeBlocks, find_blocks, fuse_blocks, fusion_backend
-from gs2d.meshing.unbounded import derive_cascade, find_cascade_blocks, fused_cascade_surface
 
 RADIUS = 0.9
 T = TypeVar("T")

@@ -36,8 +36,8 @@ def counted() -> dict[str, int]:
 
 LIMITS = {
     "commands": 16,
-    "options of all commands": 304,
-    "options by name": 75,
+    "options of all commands": 303,
+    "options by name": 74,
     "settings by name": 26,
     "recipes": 23,
     "fields of recipes": 103,

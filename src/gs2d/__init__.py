@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from gs2d.io.meshes import write_mesh
     from gs2d.losses.base import Loss, LossView, compute_losses
     from gs2d.losses.formulas import normals_from_depth
+    from gs2d.meshing.mesh_methods import register_mesh_method
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
     from gs2d.pipeline.prepare.options import MeshOptions, Training, TrainOptions
     from gs2d.render.api import rasterize, splat_errors
@@ -91,6 +92,7 @@ __all__ = [
     "register_evaluator",
     "register_format",
     "register_loss",
+    "register_mesh_method",
     "register_quantity",
     "register_reader",
     "register_recipe",
@@ -148,6 +150,7 @@ _HOME = {
     "register_densifier": "gs2d.config.densify",
     "register_evaluator": "gs2d.evaluation.evaluators",
     "register_format": "gs2d.io.formats.splat_formats",
+    "register_mesh_method": "gs2d.meshing.mesh_methods",
     "register_loss": "gs2d.config.loss_registry",
     "register_quantity": "gs2d.config.quantities",
     "register_reader": "gs2d.data.readers.capture_readers",

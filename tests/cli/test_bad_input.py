@@ -174,7 +174,7 @@ def test_options_that_make_no_sense_give_one_line_and_leave_nothing(
         (["--bbox", "1", "0", "0", "0", "1", "1"], "corner"),
         (["--subject-box", "0", "0", "0", "1", "inf", "1"], "corner"),
         (["--subject-box", "90", "90", "90", "91", "91", "91"], "splats"),
-        (["--subject-box", "0", "0", "0", "1", "1", "1", "--unbounded"], "exclude"),
+        (["--subject-box", "0", "0", "0", "1", "1", "1", "--method", "unbounded"], "exclude"),
     ],
 )
 def test_a_box_that_makes_no_sense_changes_nothing_in_the_run(

@@ -115,6 +115,11 @@ def test_another_process_finds_the_package_and_exports_its_format(
     assert "splats: 58" in gs2d("info", tmp_path / "a.ply").stdout
 
 
+def test_its_method_makes_a_mesh(gs2d: CliProcess, trained: Path, tmp_path: Path) -> None:
+    made = json.loads(gs2d("mesh", trained, "--method", "example-coarse", "--out", tmp_path / "a.ply", "--json").stdout)
+    assert made["method"] == "example-coarse"
+
+
 def test_its_evaluator_scores_the_surface(gs2d: CliProcess, trained: Path) -> None:
     (trained.parent / "ball" / "vertices.txt").write_text("7")
     (trained.parent / "link" / "vertices.txt").write_text("7")

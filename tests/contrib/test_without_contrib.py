@@ -17,12 +17,13 @@ from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.capture_readers import READERS
 from gs2d.evaluation.evaluators import EVALUATORS
 from gs2d.io.formats.splat_formats import LAYOUTS, SPLAT_READERS
+from gs2d.meshing.mesh_methods import MESH_METHODS
 from gs2d.report.sections.section_registry import SECTIONS
 
 SOURCE = Path(gs2d.__file__).parent
 CONTRIB_USES: tuple[Registry, ...] = (
     *(COMMANDS, PROTOCOLS, RECIPES, DATA_SETS, READERS, EVALUATORS),
-    *(LAYOUTS, SPLAT_READERS, SECTIONS),
+    *(LAYOUTS, SPLAT_READERS, SECTIONS, MESH_METHODS),
 )
 
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gs2d.contrib.surfaces.unbounded import CascadeSurface, TsdfCascade, find_cascade_blocks, fused_cascade_surface
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import DepthMap, RenderedView
 from gs2d.meshing.fusion_bounds import FusionBounds
 from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
-from gs2d.meshing.unbounded import CascadeSurface, TsdfCascade, find_cascade_blocks, fused_cascade_surface
 from surface_shapes import rays, sphere_depth
 
 GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it

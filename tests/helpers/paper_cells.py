@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,6 @@ def make_row(name: str, *cells: Cell, paper: Mapping[str, Any] | None = None) ->
 
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
-    """Disable reports and figures: drawing takes seconds and is tested elsewhere."""
+    """Disable reports: drawing takes seconds and is tested elsewhere."""
     for module in ("train.train_run", "finish.run_report"):
         patch.setattr(f"gs2d.pipeline.{module}.report_run", lambda path, *_: path)
-    patch.setattr("gs2d.contrib.lab.figures.write_figures", _draw_labels)
-
-
-def _draw_labels(runs: Mapping[str, Path], out: Path, *_: object, maps: Sequence[str]) -> tuple[Path, ...]:
-    """Replace ``write_figures``: write an image that only lists the requested figures."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "traces.svg").write_text(f"{sorted(runs)} {sorted(maps)}")
-    return (out / "traces.svg",)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cascade_scenes import fused_levels
+from gs2d.contrib.surfaces.unbounded import derive_cascade
 from gs2d.core.camera import Camera
 from gs2d.errors import BackendError
 from gs2d.kernels.library import available_variants
@@ -23,7 +24,6 @@ from gs2d.meshing.tsdf_volume import (
     integrator,
     invalid_volume,
 )
-from gs2d.meshing.unbounded import derive_cascade
 from surface_shapes import limits, orbit, sphere_depth
 
 ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")

@@ -8,10 +8,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gs2d.contrib.surfaces.unbounded import extract_unbounded
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import RenderedView
-from gs2d.meshing.extract import ExtractOptions, extract, extract_unbounded
+from gs2d.meshing.extract import ExtractOptions, extract
 from surface_shapes import rays
 
 ROOM = np.array([3.0, 2.0, 1.3])  # half side lengths; the cameras are inside

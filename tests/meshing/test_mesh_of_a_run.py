@@ -1,4 +1,4 @@
-"""``gs2d mesh RUN --unbounded``: a tiny run meshed without bounds, and the messages."""
+"""``gs2d mesh RUN --method unbounded``: a tiny run meshed without bounds, and the messages."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_an_unbounded_mesh_of_a_run_reports_its_levels(run: Path, tmp_path: Path) -> None:
-    result = mesh_run(run, MeshOptions(unbounded=True, voxel=0.05), out=tmp_path / "far.ply", threads=1)
-    assert result["unbounded"] is True
+    result = mesh_run(run, MeshOptions(method="unbounded", voxel=0.05), out=tmp_path / "far.ply", threads=1)
+    assert result["method"] == "unbounded"
     assert result["levels"] >= 1
     mesh = read_mesh(tmp_path / "far.ply")
     assert len(mesh.faces) == result["faces"] > 100
@@ -120,10 +120,8 @@ def test_a_run_fuses_the_depth_of_its_protocol(run: Path, tmp_path: Path) -> Non
         check_same_run(old, replace(job.resolved, protocol=replace(job.protocol, near=0.3)))
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
-def test_a_run_is_fused_by_its_backend(
-    run: Path, tmp_path: Path, unbounded: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("method", ["tsdf", "unbounded"])
+def test_a_run_is_fused_by_its_backend(run: Path, tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
     def recorded(
@@ -135,7 +133,7 @@ def test_a_run_is_fused_by_its_backend(
     job, splats = reload_run(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
     monkeypatch.setattr("gs2d.meshing.tsdf_volume.integrator", recorded)
     for backend in ("reference", *(["cpu"] if available_variants() else [])):
-        options = MeshOptions(unbounded=unbounded, voxel=0.05)
+        options = MeshOptions(method=method, voxel=0.05)
         result = extract_mesh(
             replace(job, backend=get_backend(backend)), splats, options, tmp_path / "mesh.ply", lambda _event: None
         )

@@ -58,7 +58,7 @@ def test_a_subject_box_becomes_the_subject_and_limits_the_mesh(undisturbed: RunF
     vertices = read_mesh(out).vertices
     assert (np.abs(vertices) <= np.array(BOX[3:]) + 0.05 * 8).all()
     assert {"pixels", "faces_per_pixel"} <= result.keys()
-    for options in (MeshOptions(whole_scene=True), MeshOptions(bbox=BOX), MeshOptions(unbounded=True)):
+    for options in (MeshOptions(whole_scene=True), MeshOptions(bbox=BOX), MeshOptions(method="unbounded")):
         assert meshed_subject(run, generic, splats, options, said.append) is None
         with pytest.raises(ProtocolError, match="exclude each other"):
             meshed_subject(run, generic, splats, replace(options, subject_box=BOX), said.append)

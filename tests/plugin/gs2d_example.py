@@ -16,6 +16,7 @@ from gs2d.data.camera_models import CameraModel
 from gs2d.errors import DivergedError
 from gs2d.io.gaussians import Gaussians
 from gs2d.losses.base import LossReport
+from gs2d.meshing.extract import extract
 from gs2d.render.cpu_backend import CpuBackend
 from gs2d.training.actions.entry_action import EntryAction
 from gs2d.training.densify.densifier import Densifier
@@ -176,6 +177,12 @@ def read_xyz(path, tell):
     flat, quats = ones * [-4.0, -4.0, -40.0], ones * [1.0, 0.0, 0.0, 0.0]
     empty = np.zeros((count, 0, 3), np.float32)
     return Gaussians(means, np.float32(quats), np.float32(flat), ones[:, 0], 0 * means, empty), "text"
+
+
+@gs2d.register_mesh_method("example-coarse")
+def coarse(frames, options, *, threads, backend):
+    """Fuse large voxels."""
+    return extract(frames, replace(options, resolution=32), threads=threads, backend=backend)
 
 
 @gs2d.register_evaluator("example-vertices")

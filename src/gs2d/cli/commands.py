@@ -83,7 +83,7 @@ class TrainCommand(TrainOptions, Common):
     "mesh",
     action="gs2d.cli.handlers:mesh",
     group=STEPS,
-    first=("run", "out", "texture", "method", "refine", "voxel", "bbox", "unbounded"),
+    first=("run", "out", "texture", "method", "refine", "voxel", "bbox"),
 )
 @dataclass(frozen=True, kw_only=True)
 class MeshCommand(TextureOptions, MeshOptions, Common):

@@ -25,6 +25,7 @@ from gs2d.meshing.evidence import clean
 from gs2d.meshing.extract import Extraction, ExtractOptions, fused_depths, sampled
 from gs2d.meshing.fusion_bounds import FusionBounds, backproject, derive_limits, widen_truncation
 from gs2d.meshing.marching_cubes import inside_box, keep_components, select_faces
+from gs2d.meshing.mesh_methods import register_mesh_method
 from gs2d.meshing.minimum_cut import outside
 from gs2d.meshing.oriented_points import (
     PIXELS_APART,
@@ -52,6 +53,7 @@ TAUBIN = (0.5, -0.53)  # steps of smoothing: shrink and grow (Taubin 1995)
 TAUBIN_ROUNDS = 2
 
 
+@register_mesh_method("delaunay")
 def extract_delaunay(
     frames: Iterable[RenderedView] | Spool,
     options: ExtractOptions = ExtractOptions(),  # noqa: B008 (frozen)

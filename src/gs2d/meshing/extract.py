@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,10 @@ from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import clean
 from gs2d.meshing.fusion_bounds import DepthSample, FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.marching_cubes import inside_box, keep_components
+from gs2d.meshing.mesh_methods import register_mesh_method
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES, fused_surface
 from gs2d.meshing.tsdf_volume import find_blocks, fusion_backend
-from gs2d.meshing.unbounded import FAR_VIEWS, derive_cascade, find_cascade_blocks, fused_cascade_surface
 from gs2d.render.backends import Backend
 
 SAMPLES_A_MAP, FEWEST_SAMPLES = 4096, 16  # pixels of a depth map that limits are derived from
@@ -45,7 +45,7 @@ class ExtractOptions:
     Attributes
     ----------
     resolution : int
-        Voxels along the longest side, see ``derive_limits`` and ``derive_cascade``.
+        Voxels along the longest side, see ``derive_limits``.
     bbox : array [2, 3] world units or None
         Box to fuse; faces outside are removed. For an unbounded scene, the innermost level.
     voxel, truncation, depth_limit : float world units or None
@@ -81,10 +81,11 @@ class ExtractOptions:
 
     @property
     def limits(self) -> dict[str, Any]:
-        """Limits, as arguments of ``derive_limits`` and ``derive_cascade``."""
+        """Limits, as arguments of ``derive_limits``."""
         return {name: getattr(self, name) for name in ("resolution", "bbox", "voxel", "truncation", "depth_limit")}
 
 
+@register_mesh_method("tsdf")
 def extract(
     frames: Iterable[RenderedView] | Spool,
     options: ExtractOptions = ExtractOptions(),
@@ -148,59 +149,6 @@ def fused_depths(
         backend=backend,
     )
     return mesh, blocks.nbytes
-
-
-def extract_unbounded(
-    frames: Iterable[RenderedView] | Spool,
-    options: ExtractOptions = ExtractOptions(),
-    *,
-    threads: int | None = None,
-    backend: str | Backend = "auto",
-) -> Extraction:
-    """Fuse depth maps of an unbounded scene into a mesh, with voxels that grow with the distance from its centre.
-
-    Parameters
-    ----------
-    frames, options, threads, backend
-        As for ``extract``.
-
-    Returns
-    -------
-    Extraction
-        ``limits`` are those of the innermost level, with ``lower`` and ``upper`` of the outermost.
-
-    Raises
-    ------
-    ProtocolError, ShapeError, DiskError, BackendError
-        As ``extract``.
-    """
-    backend = fusion_backend(backend)
-    with Spool.of(frames) as spool:
-        samples = sampled(spool)
-        cascade = derive_cascade(samples, spool.cameras, **options.limits)
-        if options.truncation is None:
-            inner = cascade.levels[0]
-            # distant depths differ more, but their levels have wider truncations
-            noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
-            cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
-        del samples
-        trim()
-        blocks = find_cascade_blocks(spool, cascade, max_bytes=options.max_bytes, threads=threads, backend=backend)
-        count, volume_bytes = len(spool), sum(level.nbytes for level in blocks)
-        mesh = fused_cascade_surface(
-            spool,
-            cascade,
-            blocks,
-            min_weight=options.min_weight,
-            far_weight=min(FAR_VIEWS, count / 2),
-            slab_bytes=options.slab_bytes,
-            threads=threads,
-            backend=backend,
-        )
-        trim()
-        mesh = simplify(keep_components(mesh, keep=options.keep), error=options.error, cameras=spool.cameras)
-    limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
-    return Extraction(mesh, limits, count, volume_bytes, len(cascade.levels), backend.name)
 
 
 def sampled(spool: Spool) -> list[DepthSample]:

@@ -69,7 +69,6 @@ def write_demo_capture(
         Created if missing; files of an earlier capture are replaced.
     seed : int
         For the twigs, the textures, and small motions of the cameras.
-    train_views, test_views : int
     size : int
         Width and height, px.
     vary : collection of str

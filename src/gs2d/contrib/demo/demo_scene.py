@@ -19,7 +19,6 @@ class DemoPart:
 
     Attributes
     ----------
-    name : str
     patch : Patch
     texture : ndarray [rows, columns, 3] float32, linear light
     gloss : float
@@ -38,7 +37,6 @@ class ToyScene:
 
     Attributes
     ----------
-    parts : tuple of DemoPart
     patch : Patch
         The joined parts.
     part_of_face : ndarray [F] int64

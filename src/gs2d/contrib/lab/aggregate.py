@@ -26,13 +26,10 @@ class Cell:
 
     Attributes
     ----------
-    scene, data_set : str
-    seed : int
     figures : dict
         One entry for each of FIGURES; None where there is none.
     reasons : dict
         Reasons of figures that are None.
-    run : Path
     details : dict
         Further facts: splats, surface thresholds, image metrics of each stage, measured views.
     """
@@ -275,12 +272,10 @@ class StageStep:
     ----------
     lower, upper : str
         Rows; in the paper ``upper`` is better (or not worse, or equal).
-    metric : str
     difference : float
         Mean over scenes and seeds of upper minus lower, with inverted sign if lower values are better.
     spread : float or None
         Standard deviation over seeds of the mean over scenes of the difference.
-    seeds : int
     seeds_with_sign : int
         Number of seeds with the order of the paper.
     """

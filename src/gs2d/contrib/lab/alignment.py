@@ -72,7 +72,6 @@ class IcpResult:
         Part of the source with a target within the threshold, at the start and at the end.
     rms_before, rms : float or None
         Of the distances of those; None where there are none.
-    iterations : int
     converged : bool
         Whether it stopped because nothing changed.
     """

@@ -41,7 +41,6 @@ class MissingPiece:
 
     Attributes
     ----------
-    path : Path
     purpose : str
         Use of the file, such as "for training".
     source : str

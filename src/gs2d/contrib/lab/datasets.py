@@ -48,7 +48,6 @@ class DataSet:
 
     Attributes
     ----------
-    name, title : str
     scenes : tuple of SceneFacts
         In the order of the paper's tables.
     evaluator : str

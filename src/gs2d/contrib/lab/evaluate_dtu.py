@@ -38,7 +38,6 @@ class DtuTruth:
 
     Attributes
     ----------
-    scan : int
     points : ndarray [P, 3]
         The structured-light scan (``stlNNN_total.ply``).
     observed : ndarray [X, Y, Z] bool
@@ -154,8 +153,6 @@ class DtuScore:
         Self-check: whether reconstruction and scan coincide.
     messages : tuple of str
         Warnings, one line each.
-    clouds : ScoredClouds
-    reason : str or None
     """
 
     accuracy: float | None

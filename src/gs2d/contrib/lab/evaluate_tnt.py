@@ -121,7 +121,6 @@ class TntTruth:
 
     Attributes
     ----------
-    scene : str
     points : ndarray [P, 3]
         The laser scan, m.
     crop : CropVolume
@@ -257,7 +256,6 @@ class Alignment:
         Change of scale and rotation by the stages.
     transform_alone : float or None
         tau. rms error of the mesh with ``_trans.txt`` alone.
-    stages : tuple of StageReport
     T_truth_mesh : ndarray [4, 4]
     """
 
@@ -282,16 +280,13 @@ class TntScore:
 
     Attributes
     ----------
-    tau : float
     precision, recall, f_score : float or None
     accuracy, completeness, chamfer : float or None
         Mean distance from the reconstruction to the scan, back, and the mean of the two (not part of the protocol).
     mesh_points, truth_points : int
         Number of scored points.
-    alignment : Alignment
     clouds : ScoredClouds
         The scored points with their distances.
-    reason : str or None
     """
 
     tau: float
@@ -328,7 +323,6 @@ def evaluate_tnt(
         Names of all photographs of the capture.
     centers : ndarray [n, 3]
         Their camera centres, in the capture's frame.
-    truth : TntTruth
     tau : float
         m.
     published : ndarray [m, 4, 4], optional

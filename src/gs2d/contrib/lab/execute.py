@@ -35,7 +35,6 @@ class Workers:
         many as fit.
     threads : int or None
         CPU threads of each parallel task; None: the cores divided by the number of tasks.
-    backend : str
     cluster : str or None
         Address of a Ray cluster, ``HOST:PORT`` or ``auto`` for the cluster of this machine; None: this machine.
     """
@@ -65,7 +64,6 @@ def execute(
         Output folder of the tasks, locked while they run. The operating system releases the lock of a killed process.
     on_event : callable
         Receives the events of a single task, or the progress of several tasks.
-    workers : Workers
     before : callable
         Called when the folder is locked.
     after_task : callable

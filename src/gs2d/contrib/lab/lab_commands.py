@@ -13,8 +13,12 @@ from gs2d.contrib.lab.lab_options import BlocksOptions, PaperOptions, SweepOptio
 _ACTIONS = "gs2d.contrib.lab.show_table"
 
 
-def _continued(options: TableOptions, words: Sequence[str]) -> str:
-    return f"; continue with: gs2d {shlex.join(words)}" if options.train else ""
+class Continued(TableOptions, Common):
+    """A command that another call continues."""
+
+    def after_interrupt(self, words: Sequence[str]) -> str:
+        """Return the command that continues."""
+        return f"; continue with: gs2d {shlex.join(words)}" if self.train else ""
 
 
 @register_command(
@@ -35,12 +39,8 @@ class BlocksCommand(BlocksOptions, Common):
     first=("recipes", "data", "out", "seeds", "schedule_scale", "train"),
 )
 @dataclass(frozen=True, kw_only=True)
-class SweepCommand(SweepOptions, Common):
+class SweepCommand(SweepOptions, Continued):
     """Compare recipes on scenes and seeds, as a table."""
-
-    def after_interrupt(self, words: Sequence[str]) -> str:
-        """Return the command that continues."""
-        return _continued(self, words)
 
 
 @register_command(
@@ -50,9 +50,5 @@ class SweepCommand(SweepOptions, Common):
     first=("table", "data", "out", "scenes", "schedule_scale", "train"),
 )
 @dataclass(frozen=True, kw_only=True)
-class PaperCommand(PaperOptions, Common):
+class PaperCommand(PaperOptions, Continued):
     """Reproduce a table of the paper."""
-
-    def after_interrupt(self, words: Sequence[str]) -> str:
-        """Return the command that continues."""
-        return _continued(self, words)

@@ -14,7 +14,7 @@ from gs2d.contrib.lab.deviations import deviations_of
 from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
 from gs2d.contrib.lab.paper_tables import DTU, TNT, PaperRow, PaperTable
-from gs2d.contrib.lab.render import to_csv, to_latex, to_markdown, write_page
+from gs2d.contrib.lab.render import to_latex, to_markdown, write_page
 from gs2d.contrib.lab.scenes import FoundScene
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
 from gs2d.contrib.lab.table_plan import Plan, commands_of, make_plan, paper_command
@@ -38,8 +38,6 @@ class PaperResult:
     ----------
     files : tuple of Path
         table.json first.
-    results : Results
-    checked : tuple of ClaimResult
     failures : dict
         Reasons of failed runs by name.
     unfinished : int
@@ -130,7 +128,7 @@ def _defining(options: TableOptions) -> dict[str, Any]:
 
 # -- tabulating ------------------------------------------------------------------------------------------------------
 def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> PaperResult:
-    """Write table.json, .md, .csv, .tex, about.json and, with images, index.html from the finished runs."""
+    """Write table.json, .md, .tex, about.json and, with images, index.html from the finished runs."""
     unfinished = sum(task.outcome()["state"] not in ("done", "failed") for task in plan.tasks)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     checked = check_claims(plan.table, results)
@@ -142,7 +140,6 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> 
     write_json(out / ABOUT, {**facts, "deviations": deviations})
     texts = {
         "table.md": to_markdown(plan.table, results, checked, deviations, [facts["command"], *commands]),
-        "table.csv": to_csv(results),
         "table.tex": to_latex(plan.table, results),
     }
     for name, text in texts.items():
@@ -150,7 +147,7 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> 
             file.write(text)
     files = [out / name for name in ("table.json", *texts, ABOUT)]
     if images:
-        files.append(write_page(plan.table, results, checked, deviations, commands, facts, out, on_event))
+        files.append(write_page(plan.table, results, checked, deviations, commands, facts, out))
     return PaperResult(plan.table, tuple(files), results, checked, failures(plan.tasks), unfinished)
 
 

@@ -38,7 +38,6 @@ class Claim:
         A key of METRICS, or "surface": F-score or Chamfer distance, by data set.
     rows : tuple of str
         Labels: from worst to best ("ascending"), the best last ("best"), or all alike ("flat").
-    kind : str
     within : float or None
         For "flat": largest difference of two rows, slightly above that of the paper.
     """

@@ -52,7 +52,6 @@ class Partition:
     grid : tuple of int
         Number of blocks along the axes of the largest spread of cameras and sparse points, two (on the ground) or
         three. ``()``: as many as memory needs.
-    coarse : CoarseModel
     margin : float
         Fraction of the mean cell side by which a block trains beyond its cell, so that surfaces at a seam are trained
         with their surroundings. Multiplies the trained splats by (1 + 2 margin)^2.
@@ -178,7 +177,6 @@ def grid_for(blocks: int, spread: Sequence[float], flat: float) -> tuple[int, ..
 
     Parameters
     ----------
-    blocks : int
     spread : three floats
         Of cameras and points along the axes, largest first.
     flat : float

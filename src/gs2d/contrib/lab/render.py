@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import functools
-import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,16 +12,14 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from gs2d.config.presets import about_recipe, get_recipe
-from gs2d.contrib.lab.aggregate import FIGURES, Cell, ClaimResult, Results, Row
+from gs2d.config.presets import about_recipe
+from gs2d.contrib.lab.aggregate import Cell, ClaimResult, Results, Row
 from gs2d.contrib.lab.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.core.atomic_files import atomic_write
 from gs2d.data.image_files import read_image
-from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import RENDERS
 from gs2d.report.gallery import read_index
-from gs2d.report.html_parts import drawing, image_tag, page
-from gs2d.training.events import OnEvent, ignore
+from gs2d.report.html_parts import image_tag, page
 
 DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 2, "seconds": 0}
 TITLES = {**METRICS, "bytes": "MB", "seconds": "s"}
@@ -32,10 +28,6 @@ RUN_METRICS = ("psnr", "ssim", "lpips", "fscore", "chamfer")
 RUN_HEADS = ["row", "scene", "seed", *(METRICS[m] for m in RUN_METRICS), "splats", "PSNR at the clone", "MB", "s"]
 IMAGES = {"color": "Colour", "normal": "Normals", "error": "Error"}
 IMAGE_WIDTH = 300  # px
-FIGURE_TITLES = {
-    "traces": "Mean coverage K_a and mean opacity over the iterations",
-}
-MAP_TITLE = "E_i, the colour error of each splat, and the high-error splats"
 
 
 def shown(metric: str, value: float | None) -> str:
@@ -89,11 +81,8 @@ class TablePart:
 
     Attributes
     ----------
-    data_set : str
-    trained : bool
     columns : tuple of str
         Metrics.
-    rows : tuple of ShownRow
     scenes : list of str
         Scenes in the means.
     """
@@ -212,23 +201,6 @@ def to_markdown(
     return _templates().get_template("table.md").render(values, parts=parts_of(table, results))
 
 
-def to_csv(results: Results) -> str:
-    """Return one line for each row, data set, scene and seed, and for the mean of each data set."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    quoted = METRICS if any(row.paper for row in results.rows) else ()
-    writer.writerow(["row", "recipe", "data_set", "scene", "seed", *FIGURES, *(f"paper_{m}" for m in quoted)])
-    for row in results.rows:
-        for data_set in dict.fromkeys([*(c.data_set for c in row.cells), *row.paper]):
-            place, paper = (row.name, row.recipe, data_set), [row.paper.get(data_set, {}).get(m) for m in quoted]
-            for cell in row.of(data_set):
-                figures = [cell.figures[name] for name in FIGURES]
-                writer.writerow([*place, cell.scene, cell.seed, *figures, *[None] * len(paper)])
-            if row.of(data_set) or any(paper):  # else a method without figures in the paper
-                writer.writerow([*place, "mean", None, *results.mean(row, data_set).values(), *paper])
-    return out.getvalue()
-
-
 _TEX = str.maketrans(
     {
         **{c: f"\\{c}" for c in "&%_#${}"},
@@ -279,7 +251,6 @@ def write_page(
     commands: Sequence[str],
     about: dict[str, Any],
     out: Path,
-    on_event: OnEvent = ignore,
 ) -> Path:
     """Write ``index.html`` into a folder."""
     template = _templates().get_template("page.html")
@@ -290,7 +261,6 @@ def write_page(
         known=[claim for claim in checked if claim.holds != "unknown"],
         deviations=deviations,
         scenes=side_by_side(results),
-        changes=own_figures(results, out, on_event),
         run_heads=RUN_HEADS,
         runs=[_run(row, cell) for row in results.rows for cell in row.cells],
         about=about,
@@ -358,42 +328,3 @@ def _last_image(run: Path, file: str, what: str) -> Path:
 def _image(path: Path, alt: str) -> Markup:
     found = image_tag(read_image(path), alt=alt, width=IMAGE_WIDTH) if path.exists() else '<div class="soft">none</div>'
     return Markup(found)
-
-
-def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[dict[str, Any]]:
-    """Return the paper's figures of each scene: K_a and opacity, traces of the attributes, a map of E_i."""
-    from gs2d.contrib.lab.figures import coverage, write_figures  # loads torch
-
-    found = []
-    ranking = {row.name for row in results.rows if row.recipe is not None and _ranks(row.recipe)}
-    for scene, runs in _runs_by_scene(results).items():
-        maps = [name for name in runs if name in ranking][-1:]  # one, as it needs the photographs
-        section: dict[str, Any] = {"name": scene, "error": "", "drawings": [], "coverage": []}
-        try:
-            if runs:
-                paths = write_figures(runs, out / "figures" / scene, on_event, maps=maps)
-                section["drawings"] = [_drawing(path) for path in paths]
-                section["coverage"] = coverage_rows(coverage(runs))
-        except Gs2dError as error:
-            section["error"] = str(error)
-        if any(section[key] for key in ("error", "drawings", "coverage")):
-            found.append(section)
-    return found
-
-
-def coverage_rows(means: Mapping[str, Sequence[float]]) -> list[list[str]]:
-    """Return mean K_a and opacity of each row after stage 1, and both at the end."""
-    forms = (".2e", ".3f", ".2e", ".3f")
-    return [[name, *(f"{v:{form}}" for v, form in zip(values, forms, strict=True))] for name, values in means.items()]
-
-
-def _ranks(recipe: str) -> bool:
-    """Return whether a recipe ranks splats by error."""
-    return any(stage.name == "appearance" for stage in get_recipe(recipe).stages)
-
-
-def _drawing(path: Path) -> Markup:
-    title = FIGURE_TITLES.get(path.stem, MAP_TITLE)
-    if path.suffix == ".svg":
-        return Markup(drawing(path.read_text(encoding="utf-8"), title))
-    return Markup(image_tag(read_image(path), title, alt=title, width=1400))

@@ -33,9 +33,6 @@ class FoundScene:
     ----------
     name : str
         Name of the folder.
-    path : Path
-    format : str
-    protocol : Protocol
     downscale : int
         Factor by which the protocol shrinks images.
     data_set : str

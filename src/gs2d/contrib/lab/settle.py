@@ -42,12 +42,10 @@ class Settled:
 
     Attributes
     ----------
-    scene : Scene
     recipe : Recipe
         Recipe of one training of the whole scene.
     protocol : Protocol
         With near plane and background of the whole scene.
-    backend : Backend
     capture : str
         Hash of cameras, points, and sizes and times of files, to detect changes of the capture.
     """

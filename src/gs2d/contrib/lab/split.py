@@ -109,14 +109,10 @@ def split_model(
 
     Parameters
     ----------
-    splats : Splats
-    scene : Scene
     partition : Partition
         With a grid.
     raster : RasterSettings
         Settings of training.
-    backend : Backend
-    folder : Path
 
     Raises
     ------
@@ -254,8 +250,6 @@ def merge(coarse: Splats, split: Split, trained: dict[str, Splats], rows: dict[s
 
     Parameters
     ----------
-    coarse : Splats
-    split : Split
     trained : dict of name to Splats
         Splats of the trained blocks.
     rows : dict of name to ndarray [N]

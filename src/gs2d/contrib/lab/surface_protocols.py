@@ -39,7 +39,6 @@ class TntSurface:
         m. Camera centres that agree within it are inliers.
     camera_sample : int
         Pairs in a random sample.
-    stages : tuple of IcpStage
     max_points : int
         Of each cloud in a stage without a voxel.
     fraction_change, rms_change : float
@@ -82,7 +81,6 @@ class DtuSurface:
         mm. Distances from here on are dropped.
     dilation : float
         px of an image ``dilation_width`` wide: the silhouettes that cull the mesh are widened by this radius.
-    dilation_width : int
     min_fraction : float
         The self-check: at least this part of the points lies within ``max_distance`` of the scan.
     """

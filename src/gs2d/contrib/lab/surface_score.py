@@ -240,15 +240,12 @@ class SurfaceScore:
         Mean distance from the reconstruction to the truth, and from the truth to the reconstruction.
     chamfer : float or None
         Their mean.
-    accuracy_median, completeness_median : float or None
-    scores : tuple of ThresholdScore
     diagonal : float
         Of the bounding box of the truth.
     mesh_points, truth_points : int
         Number of scored points.
     mesh_hidden, truth_hidden : float
         Fraction of the area (of the points, for a cloud) that the cameras do not see, and that is not scored.
-    reason : str or None
     clouds : ScoredClouds or None
         The scored points with their distances, in the frame and units of the mesh; tau is the first threshold.
     """

@@ -30,7 +30,6 @@ class OfficialTruth:
 
     Attributes
     ----------
-    facts : SceneFacts
     files : mapping of str to Path
         By kind, as of ``gs2d.contrib.lab.dataset_folders.find_truth``.
     """

@@ -36,7 +36,6 @@ class Truth:
 
     Attributes
     ----------
-    path : Path
     surface : Mesh, or ndarray [P, 3] of points
     seen : ndarray [F] or None
         Number of training views that see each face.

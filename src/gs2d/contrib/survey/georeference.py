@@ -37,7 +37,6 @@ class Residual:
 
     Attributes
     ----------
-    name : str
     error : ndarray [3]
         Transformed position minus measured position, metres, in the axes of the frame.
     role : "fitted", "left out" or "check"
@@ -76,7 +75,6 @@ class Georeference:
         Latitude, longitude (degrees, WGS 84) and height (m) of the origin, if known.
     grid_scale : float
         Metres of the frame per metre on the ground, horizontally: 0.9996 to 1.0004 in UTM, else 1.
-    residuals : tuple of Residual
     doubts : tuple of str
         Warnings, one sentence each.
     facts : mapping

@@ -26,7 +26,6 @@ def write_geotiff(
 
     Parameters
     ----------
-    path : Path
     raster : ndarray [H, W, 4] uint8 or [H, W] float32
         Colours with alpha, or elevations in metres with :data:`NO_DATA`.
     corner : (float, float), metres

@@ -31,9 +31,9 @@ from gs2d.io.run_dir import (
     RunFolder,
 )
 from gs2d.meshing.convex_pieces import convex_pieces, required
-from gs2d.meshing.delaunay import extract_delaunay
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
-from gs2d.meshing.extract import Extraction, ExtractOptions, extract, extract_unbounded
+from gs2d.meshing.extract import Extraction, ExtractOptions
+from gs2d.meshing.mesh_methods import MESH_METHODS
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
@@ -55,7 +55,7 @@ ONE_SURFACE = 0.02  # of the depth; if mean and median differ by more, a pixel s
 SEVERAL = 0.25  # weight of such a pixel
 ERROR = 0.25  # px: half of a voxel on the surface; twice as much costs 3 % of the Chamfer distance
 KEPT = (  # facts of a mesh in metrics.json
-    *("vertices", "faces", "method", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
+    *("vertices", "faces", "method", "voxel", "truncation", "depth_limit", "depth"),
     *("pixels", "faces_per_pixel"),
 )
 VOLUME_BYTES = 4 << 30  # limit of the fused volume, if the memory of the machine is unknown
@@ -146,8 +146,7 @@ def extract_mesh(
         "vertices": len(result.mesh.vertices),
         "faces": len(result.mesh.faces),
         "depth": options.depth or loaded.protocol.fused_depth,
-        "method": "delaunay" if options.watertight else options.method,
-        "unbounded": options.unbounded,
+        "method": _method_name(options),
         "levels": result.levels,
         "fused_by": result.backend,
         **asdict(result.limits),
@@ -195,14 +194,15 @@ def fused(
         seen.spool.close()  # frees disk space
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         part = f"{result.limits.cut_fraction:.0%} of the depth is"
-        if options.unbounded:
+        if not MESH_METHODS.get(options.method).bounded:
             limit = result.limits.depth_limit
             line = (
                 f"{part} beyond {limit:.4g} world units, where depth is too uncertain; --depth-limit extends the mesh"
             )
         else:
             line = (
-                f"{part} outside the fused box; --unbounded meshes everything, --bbox or --depth-limit extend the box"
+                f"{part} outside the fused box; --method unbounded meshes everything, --bbox or --depth-limit extend "
+                "the box"
             )
         on_event(Notice(line))
     return replace(result, mesh=refined(loaded, result.mesh, on_event)) if options.refine else result
@@ -223,8 +223,9 @@ def check_mesh_options(options: MeshOptions) -> None:
         raise ProtocolError(f"lods must be a whole number >= 1, got {options.lods}")
     if options.collision:
         required()  # before minutes are spent
-    if options.unbounded and (options.watertight or options.method == "delaunay"):
-        raise ProtocolError("--unbounded fuses voxels; leave out --method delaunay and --watertight")
+    MESH_METHODS.get(options.method)
+    if options.watertight and options.method not in ("tsdf", "delaunay"):
+        raise ProtocolError(f"--watertight uses --method delaunay, got {options.method}; leave one of them out")
     if options.bbox is not None:
         checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
@@ -243,7 +244,8 @@ def _extract(
     # A box or a voxel size of the user replaces all limits of the protocol.
     bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
     bbox = bbox if subject is None else subject.box
-    own = bbox is not None or options.unbounded
+    method = MESH_METHODS.get(_method_name(options))
+    own = bbox is not None or not method.bounded
     if isinstance(frames, Spool):
         on_event(Phase("fusing", 0))
     chosen = ExtractOptions(
@@ -259,12 +261,14 @@ def _extract(
         max_bytes=_volume_bytes(options),
         slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
-    delaunay = options.watertight or options.method == "delaunay"
-    extraction = extract_unbounded if options.unbounded else extract_delaunay if delaunay else extract
-    result = extraction(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
+    result: Extraction = method.extract(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface is covered well enough"))
     return result
+
+
+def _method_name(options: MeshOptions) -> str:
+    return "delaunay" if options.watertight else options.method
 
 
 def _error(loaded: RenderedScene, options: MeshOptions) -> float:

@@ -28,6 +28,7 @@ from gs2d.data.subject_box import (
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import SUBJECT, RunFolder
 from gs2d.meshing.fusion_bounds import backproject
+from gs2d.meshing.mesh_methods import MESH_METHODS
 from gs2d.pipeline.finish.trusted_depth import surface_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene
 from gs2d.pipeline.prepare.options import MeshOptions
@@ -94,7 +95,11 @@ def meshed_subject(
 def wants_subject(loaded: RenderedScene, options: MeshOptions) -> bool:
     """Return whether the subject is meshed, if there is one; raise for options that exclude each other."""
     box = options.subject_box
-    others = {"--bbox": options.bbox is not None, "--scene": options.whole_scene, "--unbounded": options.unbounded}
+    everything = not MESH_METHODS.get(options.method).bounded
+    others = {
+        **{"--bbox": options.bbox is not None, "--scene": options.whole_scene},
+        f"--method {options.method}": everything,
+    }
     check_subject_box(box, others)
     return box is not None or (loaded.protocol.fusion.subject and not any(others.values()))
 

@@ -14,7 +14,6 @@ from gs2d.errors import RunError, ShapeError
 from gs2d.io.run_dir import (
     CheckpointFile,
     RunFolder,
-    is_run,
     load_tensors,
     make_folder,
     open_run,
@@ -153,26 +152,6 @@ def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], loaded: Loade
     if (state.stage, state.step) != (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration):
         raise _unreadable(checkpoint.path, f"it holds stage {state.stage}, iteration {state.step}")
     return state
-
-
-def stage_end(run: RunFolder, loaded: LoadedRun, index: int) -> TrainState | None:
-    """Return the state at the end of a stage, from the run or from the source of a reused stage; None if it is gone."""
-    for checkpoint in run.checkpoints():
-        if (checkpoint.stage_index, checkpoint.iteration) == (index, None):
-            return _state_at(checkpoint, _read(checkpoint.path), loaded)
-    stages = run.metrics()["stages"]
-    source = Path(stages[index].get("reused_from") or "") if len(stages) > index else Path()
-    key = loaded.stage_key(index)
-    paths = [_cache_file(source.parent, key)] if source.suffix == ".pt" else []
-    if is_run(source):
-        ends = RunFolder(source).checkpoints()
-        paths = [c.path for c in ends if (c.stage_index, c.iteration) == (index, None)]
-    for path in paths:
-        with contextlib.suppress(RunError):  # missing or broken
-            payload = _read(path)
-            if payload["key"] == key:
-                return _state(path, payload)
-    return None
 
 
 # -- stages of other runs ----------------------------------------------------------------------------------------------

@@ -16,9 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.core.camera import Camera
+from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
-from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.consistency import depth_noise
+from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool
+from gs2d.meshing.extract import Extraction, ExtractOptions, sampled
 from gs2d.meshing.fusion_bounds import (
     BOX_PERCENTILES,
     DEPTH_PERCENTILE,
@@ -29,9 +32,20 @@ from gs2d.meshing.fusion_bounds import (
     backproject,
     check_positive,
     checked_box,
+    widen_truncation,
 )
-from gs2d.meshing.marching_cubes import CORNERS, EDGES, case_table, cell_surface, mixed_colors, zero_crossing
+from gs2d.meshing.marching_cubes import (
+    CORNERS,
+    EDGES,
+    case_table,
+    cell_surface,
+    keep_components,
+    mixed_colors,
+    zero_crossing,
+)
+from gs2d.meshing.mesh_methods import register_mesh_method
 from gs2d.meshing.sampling import DepthSampler, make_sampler
+from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES, slabs
 from gs2d.meshing.tsdf_volume import (
     BLOCK,
@@ -42,6 +56,7 @@ from gs2d.meshing.tsdf_volume import (
     add_all,
     block_finder,
     check_truncation,
+    fusion_backend,
     invalid_volume,
     merged,
     min_blocks,
@@ -123,8 +138,6 @@ def derive_cascade(
 
     Parameters
     ----------
-    samples : sequence of DepthSample
-    cameras : sequence of Camera
     resolution : int
         Voxels along the side of the innermost cube, not finer than half the median pixel of the nearer half.
     bbox : array [2, 3] world units, optional
@@ -359,7 +372,6 @@ def fused_cascade_surface(
     ----------
     frames : iterable of DepthMap
         Read once for each batch of slabs: a sequence or a ``Spool``.
-    cascade : TsdfCascade
     blocks : sequence of VolumeBlocks
         Of each level, from ``find_cascade_blocks``.
     min_weight, far_weight : float
@@ -552,3 +564,57 @@ def _join_triangles(nodes: _Nodes, cells: np.ndarray) -> np.ndarray:
     high = low | 1 << np.array([axis for axis, _ in EDGES])[edges]
     rows = owner[:, None]
     return np.sort(np.stack([cells[rows, low], cells[rows, high]], axis=2), axis=2)
+
+
+@register_mesh_method("unbounded", bounded=False)
+def extract_unbounded(
+    frames: Iterable[RenderedView] | Spool,
+    options: ExtractOptions = ExtractOptions(),  # noqa: B008 (frozen)
+    *,
+    threads: int | None = None,
+    backend: str | Backend = "auto",
+) -> Extraction:
+    """Fuse depth maps of an unbounded scene into a mesh, with voxels that grow with the distance from its centre.
+
+    Parameters
+    ----------
+    frames, options, threads, backend
+        As for ``extract``.
+
+    Returns
+    -------
+    Extraction
+        ``limits`` are those of the innermost level, with ``lower`` and ``upper`` of the outermost.
+
+    Raises
+    ------
+    ProtocolError, ShapeError, DiskError, BackendError
+        As ``extract``.
+    """
+    backend = fusion_backend(backend)
+    with Spool.of(frames) as spool:
+        samples = sampled(spool)
+        cascade = derive_cascade(samples, spool.cameras, **options.limits)
+        if options.truncation is None:
+            inner = cascade.levels[0]
+            # distant depths differ more, but their levels have wider truncations
+            noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
+            cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
+        del samples
+        trim()
+        blocks = find_cascade_blocks(spool, cascade, max_bytes=options.max_bytes, threads=threads, backend=backend)
+        count, volume_bytes = len(spool), sum(level.nbytes for level in blocks)
+        mesh = fused_cascade_surface(
+            spool,
+            cascade,
+            blocks,
+            min_weight=options.min_weight,
+            far_weight=min(FAR_VIEWS, count / 2),
+            slab_bytes=options.slab_bytes,
+            threads=threads,
+            backend=backend,
+        )
+        trim()
+        mesh = simplify(keep_components(mesh, keep=options.keep), error=options.error, cameras=spool.cameras)
+    limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
+    return Extraction(mesh, limits, count, volume_bytes, len(cascade.levels), backend.name)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from cascade_scenes import BALL, GROUND, cascade_of, fused_levels, mesh_of, outdoor_frames, volumes_of
+from gs2d.contrib.surfaces.unbounded import extract_unbounded, find_cascade_blocks
 from gs2d.core.camera import look_at
 from gs2d.errors import ProtocolError
 from gs2d.meshing.depth_maps import RenderedView, depth_map
-from gs2d.meshing.extract import Extraction, ExtractOptions, extract_unbounded
+from gs2d.meshing.extract import Extraction, ExtractOptions
 from gs2d.meshing.marching_cubes import components
 from gs2d.meshing.tsdf_volume import block_bytes
-from gs2d.meshing.unbounded import find_cascade_blocks
 from surface_shapes import edge_uses, is_closed_manifold, rays, signed_volume
 
 

@@ -1,0 +1,1 @@
+"""Further methods of mesh extraction."""
