@@ -12,7 +12,7 @@ RUN_PHASES = (  # names missing from a version of the code never match
     ),
     Rule("PSNR curve", ((RESULTS, "probe_psnr"),)),
     Rule("pictures", (("pipeline/finish/run_images.py", "draw_stage"),)),
-    Rule("score a stage", ((RESULTS, "_score_stage"), (RESULTS, "score_entry"))),
+    Rule("score a stage", ((RESULTS, "_score_stage"),)),
     Rule("checkpoints", (("pipeline/train/run_logger.py", "_save"),)),
     Rule("initial splats", ((LOOP, "_first_state"),)),
     Rule("rank by E_i", (("training/actions/rank_by_error.py", "run"),)),

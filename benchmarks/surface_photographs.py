@@ -17,12 +17,11 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.perturbations import disturbed, random_gains
 from benchmarks.surface_judge import PHOTOS, SCENE, TRUE_POINTS, TRUTH, SceneFacts, true_points, unproject
 from benchmarks.surface_objects import Part
 from benchmarks.surface_scenes import SCENES, Design, Environment
 from gs2d.contrib.demo import shapes
-from gs2d.contrib.demo.perturb_exposure import random_gains
-from gs2d.contrib.demo.perturb_poses import disturbed
 from gs2d.contrib.demo.shading import LAMP, BakedLight, bake, sky_radiance
 from gs2d.contrib.demo.textures import linear_to_srgb, srgb_to_linear
 from gs2d.contrib.lab.visibility import shown_points

@@ -31,8 +31,6 @@ def stage_entry(index: int) -> dict[str, Any]:
     entry = {"name": name, "iterations": iterations, "seconds": (100.0, 20.0, 45.0)[index]}
     entry |= {"splats": (20000, 20000, 20200)[index], "bytes": (4640000, 4640000, 4686400)[index]}
     entry |= {"peak_memory_bytes": 512_000_000, "test": scores(psnr), "train": scores(psnr + 1)}
-    if name == "refine":
-        entry["after_clone"] = {"test": scores(26.4), "train": scores(27.5)}
     return entry
 
 

@@ -9,12 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.perturbations import random_gains, with_gains
 
 from ball_runs import SMALL, options
-from gs2d.contrib.demo import demo_capture as toy
-from gs2d.contrib.demo.demo_command import DemoOptions
-from gs2d.contrib.demo.perturb_exposure import GAINS, random_gains, with_gains
-from gs2d.contrib.demo.run_demo import demo
 from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import RunError
 from gs2d.io.run_dir import LEARNED, RunFolder
@@ -52,27 +49,6 @@ def run(varied: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     made = train(learning(varied, tmp_path_factory.mktemp("runs") / "exposure"), listen)
     assert any(text.startswith("exposures: 0.") and "times the mean: learned.json" in text for text in notices)
     return made
-
-
-def test_the_gains_of_the_demo_have_mean_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
-    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # images without ray casting
-    monkeypatch.setattr(toy, "render_image", lambda *_: toy.SyntheticImage(drawn, np.zeros(1, bool)))
-    for name, vary in (("plain", False), ("varied", True)):
-        toy.write_demo_capture(tmp_path / name, train_views=3, test_views=1, size=16, vary=["exposure"] * vary)
-    truth = json.loads((tmp_path / "varied" / GAINS).read_text())
-    assert list(truth) == [f"train/r_{k}.png" for k in range(3)]
-    assert np.array(list(truth.values())).mean(axis=0) == pytest.approx([1, 1, 1])
-    for name, gains in truth.items():
-        before, after = (read_image(tmp_path / which / name) for which in ("plain", "varied"))
-        assert np.array_equal(before[..., 3], after[..., 3])
-        assert np.abs(after[..., :3] - np.minimum(before[..., :3] * np.array(gains), 255)).max() <= 0.5
-    assert not (tmp_path / "plain" / GAINS).exists()
-    assert (tmp_path / "varied/test/r_0.png").read_bytes() == (tmp_path / "plain/test/r_0.png").read_bytes()
-    (tmp_path / "demo").mkdir()
-    (tmp_path / "plain").rename(tmp_path / "demo" / "capture")
-    with pytest.raises(RunError, match="vary_exposure"):
-        demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_exposure=True))
 
 
 def test_the_transforms_are_written_and_their_mean_is_the_identity(run: RunFolder) -> None:

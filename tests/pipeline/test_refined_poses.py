@@ -11,10 +11,6 @@ import pytest
 import torch
 
 from ball_runs import SMALL, Stop, comparable, options
-from gs2d.contrib.demo import demo_capture as toy
-from gs2d.contrib.demo.demo_command import DemoOptions
-from gs2d.contrib.demo.perturb_poses import TRUTH
-from gs2d.contrib.demo.run_demo import demo
 from gs2d.core.transforms import perturb_pose
 from gs2d.data import load_scene
 from gs2d.errors import RunError
@@ -47,23 +43,6 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     made = train(learning(capture, tmp_path_factory.mktemp("runs") / "poses"), listen)
     assert any(text.startswith("cameras moved by ") and text.endswith("of the extent): poses.json") for text in notices)
     return made
-
-
-def test_the_demo_disturbs_cameras_and_writes_the_true_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # images without ray casting
-    image = toy.SyntheticImage(np.full((16, 16, 4), 200, np.uint8), np.zeros(1, bool))
-    monkeypatch.setattr(toy, "render_image", lambda *_: image)
-    for name, vary in (("plain", False), ("varied", True)):
-        toy.write_demo_capture(tmp_path / name, train_views=5, test_views=1, size=16, vary=["poses"] * vary)
-    plain, varied = (tmp_path / name for name in ("plain", "varied"))
-    assert (varied / TRUTH).read_bytes() == (plain / "transforms_train.json").read_bytes()
-    assert (varied / "transforms_train.json").read_bytes() != (plain / "transforms_train.json").read_bytes()
-    assert (varied / "transforms_test.json").read_bytes() == (plain / "transforms_test.json").read_bytes()
-    assert not (plain / TRUTH).exists()
-    (tmp_path / "demo").mkdir()
-    plain.rename(tmp_path / "demo" / "capture")
-    with pytest.raises(RunError, match="vary_poses"):
-        demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_poses=True))
 
 
 def test_the_poses_are_written_as_transforms_that_can_be_loaded(run: RunFolder, capture: Path, tmp_path: Path) -> None:

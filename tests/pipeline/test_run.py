@@ -65,8 +65,6 @@ def test_metrics_have_an_entry_per_stage_with_reasons_for_nulls(undisturbed: Run
             assert 0 < stage[split]["ssim"] < 1
             assert stage[split]["lpips"] is None
             assert "weights" in stage[split]["lpips_reason"]
-    assert "after_clone" not in stages[0]
-    assert stages[2]["after_clone"]["train"]["psnr"] != stages[1]["train"]["psnr"]
 
 
 def test_the_log_has_the_values_of_every_curve(undisturbed: RunFolder) -> None:
@@ -77,7 +75,7 @@ def test_the_log_has_the_values_of_every_curve(undisturbed: RunFolder) -> None:
         assert {"loss", "losses", "splats", "mean_opacity", "mean_area", "iteration"} <= set(event)
     assert any("psnr" in event for event in steps)
     kinds = {event["kind"] for event in undisturbed.events.read()}
-    assert {"initialised", "stage_started", "stage_finished", "ranked", "cloned", "after_clone"} <= kinds
+    assert {"initialised", "stage_started", "stage_finished", "ranked", "cloned"} <= kinds
 
 
 def test_images_of_every_stage_are_written_with_the_photographs(undisturbed: RunFolder) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from benchmarks.perturbations import random_gains
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from fake_backends import lacking
@@ -15,7 +16,6 @@ from gs2d.config.presets import appearance, refine, surface, with_exposure
 from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC
 from gs2d.config.quantities import EXPOSURE, Quantity
 from gs2d.config.recipe import LearningRates, Recipe
-from gs2d.contrib.demo.perturb_exposure import random_gains
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent

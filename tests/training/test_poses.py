@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from benchmarks.perturbations import disturbed
 
 from gs2d.config.presets import appearance, surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.quantities import POSES
 from gs2d.config.recipe import LearningRates, Recipe
-from gs2d.contrib.demo.perturb_poses import disturbed
 from gs2d.core.camera import look_at
 from gs2d.core.transforms import common_motion, perturb_pose, se3_exp, similarity_motions
 from gs2d.data.scene import Scene

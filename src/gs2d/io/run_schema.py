@@ -39,7 +39,7 @@ METRICS_SHAPE: Shape = {
         {
             **{"name": str, "iterations": int, "seconds": float, "splats": int, "bytes": int},
             **{"peak_memory_bytes?": _NUMBER, "train?": (_SCORES, None), "test?": (_SCORES, None)},
-            **{"reused_from?": (str, None), "after_clone?": (_SCORES, None)},
+            "reused_from?": (str, None),
             "transparent?": ({"part": float, "view": str, "worst": float}, None),
         }
     ],

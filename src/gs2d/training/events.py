@@ -1,8 +1,7 @@
 """Events of a run, as small frozen values: the trainer, the pipeline, the log and the console all use these.
 
 Events of the trainer are sent while its state is complete and can be saved. ``kind`` is the name of an event in
-``events.jsonl``. The log has three more kinds: ``notice`` (a detail), ``after_clone`` (scores just after the entry
-actions of a stage) and ``processes`` (their number).
+``events.jsonl``. The log has two more kinds: ``notice`` (a detail) and ``processes`` (their number).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.contrib.demo.demo_scene import ToyScene, build_scene
-from gs2d.contrib.demo.perturb_exposure import GAINS, random_gains, with_gains
-from gs2d.contrib.demo.perturb_poses import TRUTH, disturbed
 from gs2d.contrib.demo.shading import BakedLight, bake, shade
 from gs2d.contrib.demo.shapes import merge_vertices
 from gs2d.contrib.demo.textures import linear_to_srgb
@@ -26,7 +24,6 @@ from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
 
 CAMERA_ANGLE_X = 0.6911112  # radians, the horizontal field of view of NeRF-Synthetic
-VARIED = ("exposure", "poses")
 _SAMPLES = 4  # rays per pixel along each axis
 _OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes (y down, z forward) to OpenGL (y up, z back)
 
@@ -54,7 +51,6 @@ def write_demo_capture(
     train_views: int = 40,
     test_views: int = 8,
     size: int = 256,
-    vary: Collection[str] = (),
     on_progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
 ) -> None:
@@ -71,11 +67,6 @@ def write_demo_capture(
         For the twigs, the textures, and small motions of the cameras.
     size : int
         Width and height, px.
-    vary : collection of str
-        Names of ``VARIED``.
-        "exposure": training images get random gains (``perturb_exposure``), stored in ``exposure_gt.json``; test images
-        keep the gain 1. "poses": the written training poses are slightly wrong (``perturb_poses``); ``poses_gt.json``
-        has the true ones.
     on_progress : callable, optional
         Called with (images done, number of images) after each image, from the calling thread.
     threads : int, optional
@@ -96,13 +87,7 @@ def write_demo_capture(
     root = Path(folder)
     _make_folders(root, ("train", "test") if test_views else ("train",))
     cameras = demo_cameras(seed, train_views, test_views, size)
-    gains = random_gains(train_views, seed) if "exposure" in vary else None
-    _photograph(root, build_scene(seed), cameras, gains, on_progress, threads)
-    if gains is not None:
-        write_json(root / GAINS, {f"train/r_{k}.png": list(map(float, gain)) for k, gain in enumerate(gains)})
-    if "poses" in vary:
-        write_json(root / TRUTH, _transforms("train", cameras["train"]))
-        cameras["train"] = disturbed(cameras["train"], seed)
+    _photograph(root, build_scene(seed), cameras, on_progress, threads)
     _write_cameras(root, cameras)
 
 
@@ -110,11 +95,10 @@ def _photograph(
     root: Path,
     scene: ToyScene,
     cameras: Mapping[str, Sequence[Camera]],
-    gains: np.ndarray | None,
     on_progress: Callable[[int, int], None] | None,
     threads: int | None,
 ) -> None:
-    """Write images, mesh, and the number of training views that see each face; applies gains to training images."""
+    """Write images, mesh, and the number of training views that see each face."""
     workers = threads or min(os.cpu_count() or 1, 8)
     light = bake(scene.patch, threads=workers)
     jobs = [(split, k, camera) for split, split_cameras in cameras.items() for k, camera in enumerate(split_cameras)]
@@ -122,8 +106,7 @@ def _photograph(
     def image(job: tuple[str, int, Camera]) -> np.ndarray:
         split, k, camera = job
         result = render_image(scene, light, camera)
-        rgba = result.rgba if gains is None or split != "train" else with_gains(result.rgba, gains[k])
-        write_image(root / split / f"r_{k}.png", rgba)
+        write_image(root / split / f"r_{k}.png", result.rgba)
         return result.seen
 
     counts = np.zeros(len(scene.patch.faces), dtype=np.int64)
@@ -150,8 +133,7 @@ def _make_folders(root: Path, splits: tuple[str, ...]) -> None:
             (root / split).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise disk_error(root / split, error) from error
-    for name in ("transforms_train.json", GAINS, TRUTH):
-        (root / name).unlink(missing_ok=True)
+    (root / "transforms_train.json").unlink(missing_ok=True)
 
 
 def demo_mesh(scene: ToyScene) -> Mesh:

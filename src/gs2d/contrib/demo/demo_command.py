@@ -26,10 +26,6 @@ class DemoOptions(HowItRuns):
     """Fraction of the iterations of the recipe (default: 0.15, two minutes on two cores)."""
     learn: Annotated[str | tuple[str, ...], PYTHON_ONLY] = "none"
     """As in `gs2d train`."""
-    vary_exposure: Annotated[bool, PYTHON_ONLY] = False
-    """Vary exposure and white balance of the training images."""
-    vary_poses: Annotated[bool, PYTHON_ONLY] = False
-    """Disturb the poses of the training images by half a degree and half a percent."""
     page: bool = True
     """Do not write scene.html, the splats as a page for any browser."""
     viewer: ViewerOption = None

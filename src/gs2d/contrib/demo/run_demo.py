@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gs2d.contrib.demo.demo_capture import VARIED, write_demo_capture
+from gs2d.contrib.demo.demo_capture import write_demo_capture
 from gs2d.contrib.demo.demo_command import DemoOptions
-from gs2d.contrib.demo.perturb_exposure import GAINS
-from gs2d.contrib.demo.perturb_poses import TRUTH as TRUE_POSES
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
@@ -20,7 +18,7 @@ from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.training.events import OnEvent, Phase, RunPart, RunPlan, Step, ignore
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
-CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
+CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json")  # and mesh_gt*
 TITLE = "gs2d demo: a still life with a known surface"
 SCHEDULE_SCALE = 0.15
 PARTS = (
@@ -59,19 +57,9 @@ def demo(
             train_views=options.train_views,
             test_views=options.test_views,
             size=options.size,
-            vary=[name for name in VARIED if getattr(options, f"vary_{name}")],
             on_progress=lambda done, _total: on_event(Step(done)),
             threads=options.threads,
         )
-    for file, varied, option in (
-        (GAINS, options.vary_exposure, "vary_exposure"),
-        (TRUE_POSES, options.vary_poses, "vary_poses"),
-    ):
-        if (capture / file).exists() != varied:
-            raise RunError(
-                f"the photographs in {capture} were made with{'out' * varied} {option}; "
-                "resume with the same options, or start again with --overwrite"
-            )
     run = train(training, on_event, title=TITLE, allowed=(CAPTURE,))
     truth = capture / TRUTH
     matched = tuple(name for name in learned_names(options.learn) if name == "poses")

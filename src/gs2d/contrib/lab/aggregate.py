@@ -251,9 +251,7 @@ def _backend(definition: dict[str, Any]) -> str:
 
 
 def _scores(stage: dict[str, Any], test_on: str) -> dict[str, Any]:
-    scores = {"splats": stage["splats"], "psnr": (stage.get(test_on) or {}).get("psnr")}
-    clone = (stage.get("after_clone") or {}).get(test_on)
-    return {**scores, "psnr_after_clone": clone["psnr"]} if clone else scores
+    return {"splats": stage["splats"], "psnr": (stage.get(test_on) or {}).get("psnr")}
 
 
 def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, float | None]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 
 TITLES = {**METRICS, "bytes": "MB", "seconds": "s"}
 COSTS = ("bytes", "seconds")  # shown without a spread and without a best
 RUN_METRICS = ("psnr", "ssim", "lpips", "fscore", "chamfer")
-RUN_HEADS = ["row", "scene", "seed", *(METRICS[m] for m in RUN_METRICS), "splats", "PSNR at the clone", "MB", "s"]
+RUN_HEADS = ["row", "scene", "seed", *(METRICS[m] for m in RUN_METRICS), "splats", "MB", "s"]
 IMAGES = {"color": "Colour", "normal": "Normals", "error": "Error"}
 IMAGE_WIDTH = 300  # px
 
@@ -279,15 +278,7 @@ def _run(row: Row, cell: Cell) -> list[str | Markup]:
         figures = [Markup('-<span class="why">{}</span>').format(cell.reasons.get("psnr", "")), *"----"]
     splats = f"{cell.details['splats']:,}" if "splats" in cell.details else "-"
     costs = [shown(name, cell.figures[name]) for name in COSTS]
-    return [row.name, cell.scene, str(cell.seed), *figures, splats, at_the_clone(cell), *costs]
-
-
-def at_the_clone(cell: Cell) -> str:
-    """Return PSNR before cloning, after cloning, and at the end."""
-    for before, after in itertools.pairwise(cell.details.get("stages", [])):
-        if "psnr_after_clone" in after:
-            return " → ".join(shown("psnr", v) for v in (before["psnr"], after["psnr_after_clone"], after["psnr"]))
-    return "-"
+    return [row.name, cell.scene, str(cell.seed), *figures, splats, *costs]
 
 
 def side_by_side(results: Results) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +39,11 @@ class ResumePoint:
         Training time already spent in the current stage.
     peak_memory : int
         Bytes, of the current stage so far.
-    at_entry : dict
-        Scores after the entry actions of the current stage.
     """
 
     state: TrainState | None = None
     seconds: float = 0.0
     peak_memory: int = 0
-    at_entry: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +107,7 @@ def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint
         run.write_metrics({"stages": metrics["stages"][:finished], **kept})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
         extra = json.loads(payload["extra"])
-        return ResumePoint(state, extra["seconds"], extra["peak_memory"], extra["at_entry"])
+        return ResumePoint(state, extra["seconds"], extra["peak_memory"])
     raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
 
 
@@ -120,9 +117,9 @@ def _read(path: Path) -> dict[str, Any]:
     payload = load_tensors(path)
     try:
         size, extra = payload["events_bytes"], json.loads(payload["extra"])
-        seconds, peak, at_entry = extra["seconds"], extra["peak_memory"], extra["at_entry"]
+        seconds, peak = extra["seconds"], extra["peak_memory"]
         valid = isinstance(size, int) and isinstance(peak, int) and min(size, peak) >= 0
-        valid = valid and isinstance(seconds, int | float) and 0 <= seconds < math.inf and isinstance(at_entry, dict)
+        valid = valid and isinstance(seconds, int | float) and 0 <= seconds < math.inf
         if not (valid and isinstance(payload["key"], str) and isinstance(payload["state"], dict)):
             raise ValueError("a value of another type")
     except (LookupError, TypeError, ValueError, RecursionError) as error:

@@ -84,7 +84,7 @@ class RunLogger:
         self._progress_every = progress_every(loaded)
         self._checkpoint_interval = checkpoint_interval(loaded.resolved.execution.checkpoint_every)
         self._memory, self._gpu_memory = PeakMemory(), PeakGpuMemory(loaded.backend)
-        self._clock, self._peak, self._at_entry = StageClock(start.seconds), start.peak_memory, dict(start.at_entry)
+        self._clock, self._peak = StageClock(start.seconds), start.peak_memory
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self.psnr: float | None = None  # of the probe views
         self._signals = HeldSignals()
@@ -152,7 +152,6 @@ class RunLogger:
             self._on_event(Notice(start_text(event), detail=True))
         self._log(event)
         if isinstance(event, events.StageStarted):
-            self._score_entry(event)
             self._signals.hold()
         elif isinstance(event, events.StageFinished):
             self._finish_stage(event.index)
@@ -192,30 +191,21 @@ class RunLogger:
     def _save(self, index: int, iteration: int | None) -> None:
         """Write a checkpoint; ``iteration`` None: at the end of the stage."""
         self._peak = max(self._peak, self._memory.read())
-        extra = {"seconds": self._clock.seconds, "peak_memory": self._peak, "at_entry": self._at_entry}
+        extra = {"seconds": self._clock.seconds, "peak_memory": self._peak}
         key = self._loaded.stage_key(index, self._state.processes)
         payload = {"state": self._state.state_dict(), "extra": json.dumps(extra), "key": key}
         self._run.save_checkpoint(index, self._stage(index).name, iteration, payload)
         self._saved_at, self._saved_iteration = time.perf_counter(), iteration or 0
 
     def _reset_stage(self) -> None:
-        self._clock, self._peak, self._at_entry, self._saved_iteration = StageClock(), 0, {}, 0
+        self._clock, self._peak, self._saved_iteration = StageClock(), 0, 0
 
     def _facts(self) -> dict[str, Any]:
         """Return the entry of a stage in ``metrics.json`` without its scores."""
         facts: dict[str, Any] = {"seconds": round(self._clock.seconds, 3), "peak_memory_bytes": self._peak}
         if self._gpu_memory.read():
             facts["peak_gpu_memory_bytes"] = self._gpu_memory.read()  # before scoring adds to it
-        return {**facts, "after_clone": self._at_entry} if self._at_entry else facts
-
-    def _score_entry(self, event: events.StageStarted) -> None:
-        """Score a stage that begins with a clone, before its first iteration."""
-        if not any(action.name == "clone_in_place" for action in self._stage(event.index).on_enter):
-            return
-        with self._clock.paused():
-            self._at_entry |= self._results.score_entry()
-            self._run.events.append({"kind": "after_clone", "stage": event.stage, **self._at_entry})
-            self._phase()
+        return facts
 
     def _finish_stage(self, index: int) -> None:
         self._save(index, None)

@@ -69,15 +69,6 @@ class StageResults:
         views, loaded = self._now(self._probes, with_predicted(self._trainer.scene_now())), self._loaded
         return mean_psnr(self._trainer.drawn, views, loaded.settings, loaded.backend)
 
-    def score_entry(self) -> dict[str, Any]:
-        """Score the splats just after the entry actions of a stage."""
-        entry: dict[str, Any] = {}
-        for split, views in self._scored(last=False):
-            with attempted(f"scores of {split} views after the clone", "", self._on_event):
-                scores = self._score(split, views, f"scoring after the clone ({split})")
-                entry |= split_metrics(scores, split, of=len(self._views(split)))
-        return entry
-
     def score(self, index: int, facts: Mapping[str, Any]) -> None:
         """Score and draw a finished stage; ``facts`` go into its entry. After the last stage, errors are reported."""
         with self._attempted_at_end(index):
