@@ -151,7 +151,6 @@ def test_masks_that_leave_nothing_to_learn_from_are_an_error(
         (["--downscale", "0"], "--downscale"),
         (["--downscale", "1000"], "1000"),
         (["--schedule-scale", "-1"], "--schedule-scale must be"),
-        (["--from", "nowhere"], "expected a run folder"),
         (["--format", "colmap"], "colmap"),
         (["--subject-box", "1", "1", "1", "0", "0", "0"], "corner"),
         (["--subject-box", "0", "0", "0", "1", "1", "nan"], "got 0 0 0 1 1 nan"),

@@ -74,11 +74,6 @@ def register_command(
     -------
     callable
         Decorates a frozen dataclass of ``gs2d.cli.commands.Common``, whose fields are the options.
-
-    Raises
-    ------
-    Gs2dError
-        From the decorator, if the name is used.
     """
 
     def registered(options: Register) -> Register:

@@ -179,7 +179,7 @@ class ExportCommand(Common):
 @register_command("recipes", action="gs2d.cli.handlers:recipes", group=MEASURE)
 @dataclass(frozen=True, kw_only=True)
 class RecipesCommand(Common):
-    """List recipes, or show one: `gs2d recipes show NAME`."""
+    """List recipes, or print one as JSON: `gs2d recipes show NAME`."""
 
     action: Annotated[Literal["list", "show"], Arg(positional=True)] = "list"
     """Action."""

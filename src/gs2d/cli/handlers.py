@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from dataclasses import asdict
 from pathlib import Path
@@ -195,7 +196,6 @@ def _export_page(command: c.ExportCommand, console: Console) -> None:
 
 def recipes(command: c.RecipesCommand, console: Console) -> None:
     """``gs2d recipes``."""
-    from gs2d.config.describe import describe_recipe
     from gs2d.config.presets import RECIPES, about_recipe, get_recipe
     from gs2d.config.schedule import scale_schedule
     from gs2d.config.serialize import apply_overrides, to_json
@@ -215,9 +215,9 @@ def recipes(command: c.RecipesCommand, console: Console) -> None:
     if not command.name:
         raise RecipeError("`gs2d recipes show` needs the name of a recipe; `gs2d recipes` lists them")
     recipe = apply_overrides(scale_schedule(get_recipe(command.name), command.schedule_scale), command.overrides)
-    for line in describe_recipe(recipe):
-        console.say(line)
-    console.result(to_json(recipe))
+    values = to_json(recipe)
+    console.say(json.dumps(values, indent=2))
+    console.result(values)
 
 
 def reconstruct(command: c.ReconstructCommand, console: Console) -> None:

@@ -24,21 +24,11 @@ ACTIONS: Registry[Any] = Registry(
 def register_action(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers an entry action, so that a stage can use ``Action(name, options)``.
 
-    Parameters
-    ----------
-    name : str
-        Must not be taken.
-
     Returns
     -------
     callable
         Decorates a subclass of ``gs2d.training.actions.entry_action.EntryAction``. Its constructor takes the options as
         keyword arguments; ``run`` is called once, before the first iteration of the stage.
-
-    Raises
-    ------
-    RecipeError
-        From the decorator: the name is taken.
 
     Examples
     --------

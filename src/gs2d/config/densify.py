@@ -23,21 +23,11 @@ DENSIFIERS: Registry[Any] = Registry(
 def register_densifier(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a densifier, so that a stage can use ``Densify(name, options)``.
 
-    Parameters
-    ----------
-    name : str
-        Must not be taken.
-
     Returns
     -------
     callable
         Decorates a subclass of ``gs2d.training.densify.densifier.Densifier``. Its constructor takes the surroundings
         and the options as keyword arguments; ``before_backward`` and ``after_backward`` are called in every iteration.
-
-    Raises
-    ------
-    RecipeError
-        From the decorator: the name is taken.
 
     Examples
     --------

@@ -28,21 +28,11 @@ LEAST_START = 200  # iterations without learned quantities that a shorter schedu
 def register_quantity(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a learned quantity, so that ``Recipe.learned`` can name it.
 
-    Parameters
-    ----------
-    name : str
-        Must not be taken.
-
     Returns
     -------
     callable
         Decorates a subclass of ``gs2d.training.learned.quantity.LearnedQuantity``. Its constructor takes the
         :class:`Quantity`, the scene and the options of the quantity as keyword arguments.
-
-    Raises
-    ------
-    RecipeError
-        From the decorator: the name is taken.
 
     Examples
     --------

@@ -120,20 +120,10 @@ CAMERA_MODELS: Registry[Callable[[], CameraModel]] = Registry(
 def register_camera_model(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a camera model, for ``Lens.kind`` and ``camera_model`` in ``transforms.json``.
 
-    Parameters
-    ----------
-    name : str
-        Must not be taken.
-
     Returns
     -------
     callable
         Decorates a subclass of ``gs2d.data.camera_models.CameraModel``.
-
-    Raises
-    ------
-    DataError
-        From the decorator: the name is taken.
 
     Examples
     --------

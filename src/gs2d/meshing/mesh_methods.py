@@ -50,11 +50,6 @@ def register_mesh_method(name: str, *, bounded: bool = True) -> Callable[[Regist
     callable
         Decorates a function ``(frames, options, *, threads, backend)`` that returns a
         ``gs2d.meshing.extract.Extraction``, as ``gs2d.meshing.extract.extract`` does.
-
-    Raises
-    ------
-    ProtocolError
-        From the decorator: the name is taken.
     """
 
     def registered(extract: Register) -> Register:

@@ -14,7 +14,7 @@ from gs2d.core.missing import suggestion
 from gs2d.data import detect_format
 from gs2d.data.masks import OFF
 from gs2d.errors import DataError, ProtocolError, RunError
-from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
+from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, remove_made
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_texture import PACKAGES as TEXTURE_PACKAGES
@@ -129,8 +129,6 @@ def check_reconstruct(options: ReconstructOptions) -> None:
         for package in TEXTURE_PACKAGES:
             required(package)
     check_viewer(training)
-    if training.start_from is not None:
-        open_run(training.start_from)
     if training.cache is not None:
         remove_made(make_folder(training.cache))
     if options.resume and (out / CAPTURE / POSES_JSON).exists():

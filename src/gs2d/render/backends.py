@@ -44,21 +44,11 @@ BACKENDS: Registry[Callable[[], Backend]] = Registry(
 def register_backend(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a rasterizer backend for ``backend=name``.
 
-    Parameters
-    ----------
-    name : str
-        Must not be taken.
-
     Returns
     -------
     callable
         Decorates a subclass of ``gs2d.render.backends.Backend`` with methods ``rasterize`` and ``splat_errors``. The
         class is called without arguments, and raises BackendError if it cannot run on this machine.
-
-    Raises
-    ------
-    BackendError
-        From the decorator: the name is taken.
 
     Examples
     --------

@@ -42,21 +42,11 @@ READERS: Registry[Callable[[], Reader]] = Registry("format", "gs2d.readers", bui
 def register_reader(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a reader of captures, so that ``load_scene`` recognises its format.
 
-    Parameters
-    ----------
-    name : str
-        Name of the format, also for ``--format``; must not be taken.
-
     Returns
     -------
     callable
         Decorates a class without constructor arguments. Its method ``detect(path)`` returns whether a folder has this
         format; ``read(path, *, downscale)`` returns a Scene or a ``gs2d.data.build.Capture``.
-
-    Raises
-    ------
-    DataError
-        From the decorator, if the name is taken.
 
     Examples
     --------

@@ -100,11 +100,6 @@ def register_format(
         Decorates a function ``(path, splats)`` that writes the file. It returns a tuple with a message for each thing
         that the format cannot store, or None.
 
-    Raises
-    ------
-    DataError
-        From the decorator, if the name is taken.
-
     Examples
     --------
     >>> import gs2d, numpy as np
@@ -144,11 +139,6 @@ def register_splat_reader(
     callable
         Decorates a function ``(path, tell)`` that returns ``gs2d.io.gaussians.Gaussians`` and a description of the
         kind of file, and calls ``tell`` with a message for each thing that it dropped.
-
-    Raises
-    ------
-    DataError
-        From the decorator, if the name is taken.
     """
 
     def registered(read: Reader) -> Reader:

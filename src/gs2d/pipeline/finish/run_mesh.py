@@ -166,7 +166,7 @@ def fused(
 ) -> Extraction:
     """Fuse rendered depth of the training views; arguments as of :func:`extract_mesh`.
 
-    Without a voxel size or a limit of memory, voxels are as large as memory requires.
+    Without a voxel size, voxels are as large as memory requires.
     """
     if not len(splats):
         raise ProtocolError("there are no splats to mesh; train longer or check the cameras")
@@ -179,7 +179,7 @@ def fused(
             return seen.spool
         return _frames(loaded, splats, depth, on_event, whole=options.whole_scene)
 
-    free = options.voxel is None and options.max_gib is None and loaded.protocol.fusion.voxel is None
+    free = options.voxel is None and loaded.protocol.fusion.voxel is None
     chosen = options
     for attempt in range(COARSER * free + 1):
         try:
@@ -188,7 +188,7 @@ def fused(
         except VolumeTooLargeError as error:
             if attempt == COARSER * free:
                 raise
-            on_event(Notice(f"{error}; using voxels of this size (--max-gib or --memory allow more)"))
+            on_event(Notice(f"{error}; using voxels of this size (more --memory allows smaller ones)"))
             chosen = replace(chosen, voxel=error.voxel)
     if seen is not None:
         seen.spool.close()  # frees disk space
@@ -210,12 +210,11 @@ def fused(
 
 def check_mesh_options(options: MeshOptions) -> None:
     """Raise for invalid options, before anything is rendered."""
-    for name in ("voxel", "truncation", "depth_limit", "max_gib"):
+    for name in ("voxel", "truncation", "depth_limit"):
         value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         if value is not None and not (value > 0 and math.isfinite(value)):
-            unit = "GiB" if name == "max_gib" else "world units"
-            raise ProtocolError(f"{option} must be a positive number of {unit}, got {value}")
-        if value is not None and name != "max_gib" and not 1 / LARGEST <= value <= LARGEST:
+            raise ProtocolError(f"{option} must be a positive number of world units, got {value}")
+        if value is not None and not 1 / LARGEST <= value <= LARGEST:
             raise ProtocolError(f"{option} must be between {1 / LARGEST:g} and {LARGEST:g} world units, got {value:g}")
     if options.error is not None and not (options.error >= 0 and math.isfinite(options.error)):
         raise ProtocolError(f"--error must be a number of pixels >= 0, got {options.error}; 0 keeps all faces")
@@ -258,7 +257,8 @@ def _extract(
         by_evidence=fusion.subject,
         error=_error(loaded, options),
         watertight=options.watertight,
-        max_bytes=_volume_bytes(options),
+        # Slabs are fused one at a time, but joining and cleaning the surface needs about half of the whole volume.
+        max_bytes=VOLUME_BYTES if budget is None else budget,
         slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
     result: Extraction = method.extract(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
@@ -276,18 +276,6 @@ def _error(loaded: RenderedScene, options: MeshOptions) -> float:
     if options.error is not None:
         return options.error
     return ERROR if loaded.protocol.fusion.subject else 0.0
-
-
-def _volume_bytes(options: MeshOptions) -> int:
-    """Return the limit of the volume.
-
-    Slabs are fused one at a time, but the surface, while it is joined and cleaned, needs about half of the memory of
-    the whole volume.
-    """
-    if options.max_gib is not None:
-        return int(options.max_gib * 2**30)
-    budget = memory_budget()
-    return VOLUME_BYTES if budget is None else budget
 
 
 # -- depth maps --------------------------------------------------------------------------------------------------------

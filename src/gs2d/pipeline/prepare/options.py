@@ -149,8 +149,6 @@ class CommonTraining:
 class Training(CommonTraining):
     """Options of the commands that train a scene in one piece: `gs2d train` and `gs2d reconstruct`."""
 
-    start_from: Annotated[Path | None, Arg(name="from", metavar="RUN")] = None
-    """Reuse finished stages of another run that this recipe shares."""
     cache: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder that keeps finished stages for reuse by runs with the same scene and settings."""
     viewer: ViewerOption = None
@@ -208,7 +206,7 @@ class TrainOptions(Training, Effort, Resources, HowItRuns):
     capture. 3D Gaussians are flattened along their smallest scale."""
 
     def __post_init__(self) -> None:
-        paths_of(self, "scene", "out", "masks", "init", "start_from", "cache")
+        paths_of(self, "scene", "out", "masks", "init", "cache")
         object.__setattr__(self, "checkpoint_every", str(self.checkpoint_every))
 
 
@@ -280,8 +278,6 @@ class MeshOptions:
     """Also write convex pieces for collision tests: NAME-collision.obj beside the mesh (extra `collision`)."""
     lods: Annotated[int, SETTING] = 1
     """With --out FILE.glb: number of levels of detail in the file, each with four times the error (MSFT_lod)."""
-    max_gib: Annotated[float | None, SETTING] = None
-    """Limit of the volume in GiB (default: by --memory). The error for a larger one names a voxel size that fits."""
     depth: Annotated[Literal["mean", "median", "transmittance"] | None, SETTING] = None
     """Depth maps to fuse (default: by protocol)."""
     keep_components: Annotated[int | None, SETTING] = None

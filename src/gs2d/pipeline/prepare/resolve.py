@@ -113,8 +113,6 @@ def check_options(options: TrainOptions) -> None:
 
 def check_execution(options: TrainOptions) -> None:
     """Raise for invalid options that choose neither recipe nor protocol."""
-    if options.init is not None and options.start_from is not None:
-        raise RecipeError("--init and --from exclude each other: both set the start of training; leave one out")
     if options.downscale is not None and options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     checkpoint_interval(options.checkpoint_every)

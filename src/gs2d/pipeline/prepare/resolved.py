@@ -76,7 +76,6 @@ class Execution:
     memory: float | None = None
     prepare: str = "auto"
     checkpoint_every: str = "2m"
-    start_from: Path | None = None
     cache: Path | None = None
     page: bool = True
     subject_box: Box | None = None

@@ -1,4 +1,4 @@
-"""Choose where training starts: at a checkpoint, after the stages of another run or of a cache, or from nothing."""
+"""Choose where training starts: at a checkpoint, after the stages of a cache, or from nothing."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from gs2d.io.run_dir import (
     RunFolder,
     load_tensors,
     make_folder,
-    open_run,
-    remove_made,
     save_tensors,
 )
 from gs2d.io.run_schema import METRICS_SHAPE, check_shape
@@ -63,32 +61,17 @@ def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> Resume
     Raises
     ------
     RunError
-        If ``start_from`` has no stage in common with this run, or no checkpoint is readable.
+        If no checkpoint is readable.
     """
-    execution = loaded.resolved.execution
+    cache = loaded.resolved.execution.cache
     if run.checkpoints():
         return _resume(run, loaded, on_event)
     run.events.cut(0)
-    stages = [
-        _from_run(loaded, execution.start_from) if execution.start_from else None,
-        _from_cache(loaded, execution.cache, on_event) if execution.cache else None,
-    ]
-    usable = [stage for stage in stages if stage is not None]
-    if not usable:
+    stage = None if cache is None else _from_cache(loaded, cache, on_event)
+    if stage is None:
         run.write_metrics({"stages": [], "surface": None})
         return ResumePoint()
-    return _adopt(run, loaded, max(usable, key=lambda stage: stage.index), on_event)
-
-
-def check_sources(out: Path, loaded: LoadedRun) -> None:
-    """Raise for an invalid ``start_from`` or ``cache``, before the run to be overwritten is deleted."""
-    execution = loaded.resolved.execution
-    if execution.start_from is not None:
-        if execution.start_from.resolve() == out.resolve():
-            raise RunError(f"--from and --out are the same run, {out}; choose another --out")
-        _from_run(loaded, execution.start_from)
-    if execution.cache is not None:
-        remove_made(make_folder(execution.cache))
+    return _adopt(run, loaded, stage, on_event)
 
 
 def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
@@ -151,7 +134,7 @@ def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], loaded: Loade
     return state
 
 
-# -- stages of other runs ----------------------------------------------------------------------------------------------
+# -- stages in a cache -------------------------------------------------------------------------------------------------
 def _adopt(run: RunFolder, loaded: LoadedRun, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
     """Copy the finished stages of another run into this one."""
     name = loaded.recipe.stages[stage.index].name
@@ -161,23 +144,6 @@ def _adopt(run: RunFolder, loaded: LoadedRun, stage: FinishedStage, on_event: On
     run.save_checkpoint(stage.index, name, None, payload)
     on_event(Notice(f"stages up to {name!r} are reused from {stage.source}"))
     return ResumePoint(_state(Path(stage.source), stage.payload))
-
-
-def _from_run(loaded: LoadedRun, path: Path) -> FinishedStage:
-    """Return the last stage that another run has in common with this one."""
-    other = open_run(path)
-    ends = [c for c in other.checkpoints() if c.iteration is None and c.stage_index < len(loaded.recipe.stages)]
-    for checkpoint in reversed(ends):
-        index, payload, metrics = checkpoint.stage_index, _read(checkpoint.path), other.metrics()["stages"]
-        if payload["key"] == loaded.stage_key(index) and len(metrics) > index:
-            _state_at(checkpoint, payload, loaded)
-            log = other.events.read_bytes(payload["events_bytes"])
-            return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
-    have = ", ".join(c.stage for c in ends) or "none"
-    raise RunError(
-        f"--from {path} has no finished stage in common with this run (its stages: {have}); scene, protocol, "
-        "downscale, seed, backend, versions and the stages' settings must be the same"
-    )
 
 
 def _cache_file(folder: Path, key: str) -> Path:

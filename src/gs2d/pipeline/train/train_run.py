@@ -21,6 +21,7 @@ from gs2d.io.run_dir import (
     claim_run,
     is_run,
     make_folder,
+    remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import MeshFrames, extract_mesh, keep_facts
@@ -39,7 +40,7 @@ from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
-from gs2d.pipeline.train.resume import ResumePoint, check_sources, choose_start
+from gs2d.pipeline.train.resume import ResumePoint, choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, RunPlan, TrainingEvent, ignore
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
@@ -107,8 +108,8 @@ def _train(
     details: list[str] = []
     on_event = keeping_details(on_event, details)
     loaded = prepare_run(options, on_event, title=title, part=part)
-    if options.overwrite:
-        check_sources(options.out, loaded)
+    if options.overwrite and options.cache is not None:  # before the old run is deleted
+        remove_made(make_folder(options.cache))
     run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     with run.locked(), discard_on_failure(run), watched(loaded, on_event) as live:
         on_event = on_event if live is None else live.on_event

@@ -45,11 +45,6 @@ def register_section(name: str, *, title: str) -> Callable[[Section], Section]:
         there is nothing to show. Text from files must be escaped. If the function raises, the report shows the error
         in place of the section.
 
-    Raises
-    ------
-    RunError
-        From the decorator, if the name is taken.
-
     Examples
     --------
     >>> import gs2d
