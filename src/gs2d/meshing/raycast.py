@@ -1,8 +1,8 @@
-"""Cast rays of cameras and of distant lights at triangle meshes.
+"""Cast rays of cameras at triangle meshes.
 
 Used for the demo capture, textures, images of meshes and the visibility of surface scores. It shares no code with the
 splat rasterizers, so it can verify them. Every hit is an exact ray-triangle intersection (signed volumes, as in
-Pluecker tests). Candidate pairs are found on the image plane of the camera, or on a plane across the light.
+Pluecker tests). Candidate pairs are found on the image plane of the camera.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ def cast_camera(
     directions_y = ((np.arange(height) + 0.5) / samples - camera.cy) / camera.fy
 
     nearest = np.full(width * height, _NO_HIT, dtype=np.uint64)
-    for pair_face, pair_x, pair_y in _pairs(low, high):
+    for pair_face, pair_x, pair_y in pairs(low, high):
         dx, dy = directions_x[pair_x], directions_y[pair_y]
         e = [edges[pair_face, k, 0] * dx + edges[pair_face, k, 1] * dy + edges[pair_face, k, 2] for k in range(3)]
-        inside = _same_sign(*e)
+        inside = same_sign(*e)
         total = e[0][inside] + e[1][inside] + e[2][inside]
         face = pair_face[inside]
         depth = volume[face] / np.where(total == 0, np.inf, total)
@@ -150,9 +150,9 @@ def cast_down(vertices: np.ndarray, faces: np.ndarray, corner: tuple[float, floa
     columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
 
     nearest = np.full(width * height, _NO_HIT, dtype=np.uint64)
-    for face, x, y in _pairs(low, high):
+    for face, x, y in pairs(low, high):
         e = [edges[face, k, 0] * columns[x] + edges[face, k, 1] * rows[y] + edges[face, k, 2] for k in range(3)]
-        inside = _same_sign(*e)
+        inside = same_sign(*e)
         total = sum(part[inside] for part in e)
         met = face[inside]
         depth = sum(part[inside] * below[met, k] for k, part in enumerate(e)) / np.where(total == 0, np.inf, total)
@@ -224,7 +224,7 @@ def _reach(corners: np.ndarray, axis: int, focal: float, center: float, near: fl
     return np.fmin.reduce(every, axis=1), np.fmax.reduce(every, axis=1)
 
 
-def _pairs(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def pairs(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield all (box, x, y) of integer boxes [low, high), in chunks of bounded size."""
     extent = np.maximum(high - low, 0)
     area = extent[:, 0] * extent[:, 1]
@@ -259,81 +259,6 @@ def _hits(nearest: np.ndarray, edges: np.ndarray, directions_x: np.ndarray, dire
     return Hits(face.reshape(height, width), depth.reshape(height, width), weights.reshape(height, width, 3))
 
 
-def occluded(
-    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, direction: np.ndarray, *, cells: int = 256
-) -> np.ndarray:
-    """Whether the ray from each point towards a distant light hits a triangle.
-
-    Projected along the light, a ray is a point and a triangle is a 2D triangle. Points and triangles are binned on a
-    grid across the light, and a point is compared with the triangles that overlap its cell.
-
-    Parameters
-    ----------
-    vertices : ndarray [P, 3] world units
-    faces : ndarray [F, 3] int
-    points : ndarray [Q, 3] world units
-        Origins, moved off their surface.
-    direction : ndarray [3]
-        Unit vector towards the light.
-    cells : int
-        Cells of the grid along each axis.
-
-    Returns
-    -------
-    ndarray [Q] bool
-    """
-    axes = _frame(direction)  # rows: across, across, towards the light
-    corners = (vertices @ axes.T)[faces]  # [F, 3, 3]
-    queries = points @ axes.T  # [Q, 3]
-    blocked = np.zeros(len(points), dtype=bool)
-    if not len(points) or not len(faces):
-        return blocked
-    origin = queries[:, :2].min(axis=0)
-    cell_size = np.maximum((queries[:, :2].max(axis=0) - origin) / cells, 1e-9)
-
-    cell_xy = np.clip(((queries[:, :2] - origin) / cell_size).astype(np.int64), 0, cells - 1)
-    cell = cell_xy[:, 1] * cells + cell_xy[:, 0]
-    order = np.argsort(cell, kind="stable")
-    counts = np.bincount(cell, minlength=cells * cells)
-    starts = np.cumsum(counts) - counts
-
-    # One cell of margin, because points on the border of a cell may have been clipped or rounded into it.
-    low = np.clip(np.floor((corners[:, :, :2].min(axis=1) - origin) / cell_size).astype(np.int64), 0, cells)
-    high = np.clip(np.floor((corners[:, :, :2].max(axis=1) - origin) / cell_size).astype(np.int64) + 1, 0, cells)
-    low = np.minimum(low, cells - 1)
-    top = corners[:, :, 2].max(axis=1)
-    for face, x, y in _pairs(low, np.maximum(high, low + 1)):
-        occupied = counts[y * cells + x]
-        pair_face = np.repeat(face, occupied)
-        first = np.repeat(starts[y * cells + x], occupied)
-        within = np.arange(len(pair_face)) - np.repeat(np.cumsum(occupied) - occupied, occupied)
-        query = order[first + within]
-        above = top[pair_face] > queries[query, 2]
-        pair_face, query = pair_face[above], query[above]
-        blocked[query[_is_under(corners[pair_face], queries[query])]] = True
-    return blocked
-
-
-def _is_under(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether a ray from each point [n, 3] along +z hits its triangle [n, 3, 3]."""
-    x, y = (triangles[:, :, axis] - points[:, axis, None] for axis in (0, 1))
-    # e[k] belongs to the edge from corner k + 1 to corner k + 2, opposite to corner k.
-    e = [x[:, i] * y[:, j] - y[:, i] * x[:, j] for i, j in ((1, 2), (2, 0), (0, 1))]
-    total = e[0] + e[1] + e[2]
-    z = (e[0] * triangles[:, 0, 2] + e[1] * triangles[:, 1, 2] + e[2] * triangles[:, 2, 2]) / np.where(
-        total == 0, 1, total
-    )
-    return _same_sign(*e) & (total != 0) & (z > points[:, 2])
-
-
-def _same_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+def same_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Whether three numbers are all >= 0 or all <= 0, column by column (a reduction over an axis of 3 is slow)."""
     return np.asarray(((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0)))
-
-
-def _frame(direction: np.ndarray) -> np.ndarray:
-    """Return a right-handed frame [3, 3] whose last row is the unit ``direction``."""
-    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    across = np.cross(helper, direction)
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(direction, across), direction])

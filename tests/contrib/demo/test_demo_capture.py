@@ -13,11 +13,12 @@ from gs2d.contrib.demo import demo_capture as toy
 from gs2d.contrib.demo import shapes
 from gs2d.contrib.demo.demo_capture import demo_cameras, write_demo_capture
 from gs2d.contrib.demo.demo_scene import ToyScene, build_scene
+from gs2d.contrib.demo.shading import occluded
 from gs2d.core.camera import Camera, look_at
 from gs2d.data import load_scene
 from gs2d.errors import DiskError
 from gs2d.io.meshes import read_mesh
-from gs2d.meshing.raycast import cast_camera, occluded
+from gs2d.meshing.raycast import cast_camera
 
 TRAIN, TEST, SIZE = 3, 2, 48
 

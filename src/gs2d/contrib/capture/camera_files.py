@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gs2d.data.build import PosedImage
+from gs2d.data.build import Capture, PosedImage
 from gs2d.data.file_names import files_ending, in_any_case
+from gs2d.data.readers.capture_readers import READERS
 from gs2d.data.readers.common import parsed
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, UnusableViewError
@@ -18,6 +20,29 @@ from gs2d.io.meshes import read_points
 from gs2d.io.splat_ply import ply_kind
 
 _LARGEST = 1e300  # JSON integers are unbounded
+
+
+@dataclass(frozen=True)
+class FileReader:
+    """A reader of captures that are recognised by one file; the fields are those of ``Reader``."""
+
+    looks_for: str
+    find: Callable[[Path], Path | None]
+    read_capture: Callable[[Path], Capture]
+    before_colmap: bool = False
+
+    def detect(self, path: Path) -> bool:
+        """Whether the folder has the file."""
+        return self.find(path) is not None
+
+    def read(self, path: Path, *, downscale: int) -> Capture:
+        """Read cameras and images."""
+        return self.read_capture(path)
+
+
+def register_file_reader(name: str, reader: FileReader, module: str) -> None:
+    """Register a reader that a module of this package defines."""
+    READERS.register(name, module=module)(lambda: reader)
 
 
 def real(value: Any, where: str) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.contrib.capture.camera_files import FileReader, register_file_reader
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.camera_models import CAMERA_MODELS, Lens
@@ -19,7 +20,6 @@ from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.image_files import image_size
 from gs2d.data.masks import FOLDER
 from gs2d.data.prior_maps import DEPTHS, NORMALS, MapFiles
-from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import ImageFile, find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
@@ -85,36 +85,20 @@ def read_nerfstudio(root: Path) -> Capture:
     return Capture("nerfstudio", tuple(frames), points, skipped=tuple(skipped + unlisted), notes=tuple(notes))
 
 
-@register_reader("blender")
-class Blender:
-    """Reader of NeRF-Synthetic captures."""
+def _finder(name: str) -> Callable[[Path], Path | None]:
+    """Return a function that finds the file with a name in a folder."""
 
-    looks_for = f"{TRAIN} (Blender)"
-    before_colmap = True
+    def find(folder: Path) -> Path | None:
+        file = in_any_case(folder, name)
+        return file if file.is_file() else None
 
-    def detect(self, path: Path) -> bool:
-        """Whether the folder has ``transforms_train.json``."""
-        return in_any_case(path, TRAIN).is_file()
-
-    def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read a capture."""
-        return read_blender(path)
+    return find
 
 
-@register_reader("nerfstudio")
-class Nerfstudio:
-    """Reader of captures of nerfstudio and instant-ngp."""
-
-    looks_for = f"{CAMERAS} (nerfstudio)"
-    before_colmap = True
-
-    def detect(self, path: Path) -> bool:
-        """Whether the folder has ``transforms.json``."""
-        return in_any_case(path, CAMERAS).is_file()
-
-    def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read a capture."""
-        return read_nerfstudio(path)
+_BLENDER = FileReader(f"{TRAIN} (Blender)", _finder(TRAIN), read_blender, before_colmap=True)
+_NERFSTUDIO = FileReader(f"{CAMERAS} (nerfstudio)", _finder(CAMERAS), read_nerfstudio, before_colmap=True)
+register_file_reader("blender", _BLENDER, __name__)
+register_file_reader("nerfstudio", _NERFSTUDIO, __name__)
 
 
 def _read_meta(path: Path) -> dict[str, Any]:

@@ -17,12 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.contrib.capture.camera_files import entries, points_beside, real, reals, required, whole
+from gs2d.contrib.capture.camera_files import (
+    FileReader,
+    entries,
+    points_beside,
+    real,
+    reals,
+    register_file_reader,
+    required,
+    whole,
+)
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.file_names import files_ending, in_any_case
-from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import find_photographs, head
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
@@ -114,19 +122,7 @@ def read_alicevision(root: Path) -> Capture:
     return Capture("alicevision", tuple(frames), points, skipped=tuple(skipped), notes=tuple(notes))
 
 
-@register_reader("alicevision")
-class Meshroom:
-    """Reader of captures of Meshroom."""
-
-    looks_for = "cameras.sfm (Meshroom)"
-
-    def detect(self, path: Path) -> bool:
-        """Whether a folder has a scene of Meshroom."""
-        return scene_file(path) is not None
-
-    def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read cameras and images."""
-        return read_alicevision(path)
+register_file_reader("alicevision", FileReader("cameras.sfm (Meshroom)", scene_file, read_alicevision), __name__)
 
 
 def _version(data: Mapping[str, Any], path: Path) -> tuple[int, ...]:

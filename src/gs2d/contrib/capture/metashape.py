@@ -24,12 +24,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gs2d.contrib.capture.camera_files import points_beside, real, reals, whole
+from gs2d.contrib.capture.camera_files import FileReader, points_beside, real, reals, register_file_reader, whole
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import files_ending, in_any_case
-from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import find_photographs, head
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
@@ -100,19 +99,7 @@ def read_metashape(root: Path) -> Capture:
     return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *point_notes))
 
 
-@register_reader("metashape")
-class Metashape:
-    """Reader of captures of Metashape."""
-
-    looks_for = "cameras.xml (Metashape)"
-
-    def detect(self, path: Path) -> bool:
-        """Whether a folder has cameras of Metashape."""
-        return camera_file(path) is not None
-
-    def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read cameras and images."""
-        return read_metashape(path)
+register_file_reader("metashape", FileReader("cameras.xml (Metashape)", camera_file, read_metashape), __name__)
 
 
 def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gs2d.contrib.capture.camera_files import entries, real, reals, required, whole
+from gs2d.contrib.capture.camera_files import FileReader, entries, real, reals, register_file_reader, required, whole
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size
-from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
@@ -86,19 +85,9 @@ def read_opensfm(root: Path) -> Capture:
     )
 
 
-@register_reader("opensfm")
-class OpenSfM:
-    """Reader of captures of OpenSfM and OpenDroneMap."""
-
-    looks_for = "reconstruction.json (OpenSfM, OpenDroneMap)"
-
-    def detect(self, path: Path) -> bool:
-        """Whether a folder has a reconstruction of OpenSfM."""
-        return reconstruction_file(path) is not None
-
-    def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read cameras and images."""
-        return read_opensfm(path)
+register_file_reader(
+    "opensfm", FileReader("reconstruction.json (OpenSfM, OpenDroneMap)", reconstruction_file, read_opensfm), __name__
+)
 
 
 def _largest(path: Path) -> tuple[Mapping[str, Any], list[str]]:

@@ -24,8 +24,6 @@ class DemoOptions(HowItRuns):
     """Recipe. `gs2d recipes` lists them."""
     schedule_scale: float | None = None
     """Fraction of the iterations of the recipe (default: 0.15, two minutes on two cores)."""
-    learn: Annotated[str | tuple[str, ...], PYTHON_ONLY] = "none"
-    """As in `gs2d train`."""
     page: bool = True
     """Do not write scene.html, the splats as a page for any browser."""
     viewer: ViewerOption = None

@@ -11,7 +11,7 @@ from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.prepare.limits import use_threads
-from gs2d.pipeline.prepare.options import EvaluateOptions, HowItRuns, TrainOptions, learned_names, values
+from gs2d.pipeline.prepare.options import EvaluateOptions, HowItRuns, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.train_run import check_viewer, train
@@ -62,9 +62,8 @@ def demo(
         )
     run = train(training, on_event, title=TITLE, allowed=(CAPTURE,))
     truth = capture / TRUTH
-    matched = tuple(name for name in learned_names(options.learn) if name == "poses")
     with attempted("scores of the surface", again("evaluate", run.path, "--ground-truth", truth), on_event):
-        evaluate_run(run.path, EvaluateOptions(ground_truth=truth, match=matched), on_event)
+        evaluate_run(run.path, EvaluateOptions(ground_truth=truth), on_event)
     return run
 
 
@@ -82,7 +81,7 @@ def _train_options(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
     return TrainOptions(
         scene=options.out / CAPTURE,
         recipe=options.recipe,
-        learn=options.learn,
+        learn="none",
         viewer=options.viewer,
         schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
         page=options.page,

@@ -10,7 +10,7 @@ import numpy as np
 
 from gs2d.contrib.demo.demo_scene import ToyScene
 from gs2d.contrib.demo.shapes import Patch
-from gs2d.meshing.raycast import Hits, occluded
+from gs2d.meshing.raycast import Hits, pairs, same_sign
 
 LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
 _LAMP_COLOR = np.array([1.80, 1.62, 1.36])
@@ -146,3 +146,78 @@ def _albedo(scene: ToyScene, uv: np.ndarray, part: np.ndarray) -> np.ndarray:
         row = np.clip((uv[chosen, 1] * rows).astype(np.int64), 0, rows - 1)
         albedo[chosen] = item.texture[row, column]
     return albedo
+
+
+def occluded(
+    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, direction: np.ndarray, *, cells: int = 256
+) -> np.ndarray:
+    """Whether the ray from each point towards a distant light hits a triangle.
+
+    Projected along the light, a ray is a point and a triangle is a 2D triangle. Points and triangles are binned on a
+    grid across the light, and a point is compared with the triangles that overlap its cell.
+
+    Parameters
+    ----------
+    vertices : ndarray [P, 3] world units
+    faces : ndarray [F, 3] int
+    points : ndarray [Q, 3] world units
+        Origins, moved off their surface.
+    direction : ndarray [3]
+        Unit vector towards the light.
+    cells : int
+        Cells of the grid along each axis.
+
+    Returns
+    -------
+    ndarray [Q] bool
+    """
+    axes = _frame(direction)  # rows: across, across, towards the light
+    corners = (vertices @ axes.T)[faces]  # [F, 3, 3]
+    queries = points @ axes.T  # [Q, 3]
+    blocked = np.zeros(len(points), dtype=bool)
+    if not len(points) or not len(faces):
+        return blocked
+    origin = queries[:, :2].min(axis=0)
+    cell_size = np.maximum((queries[:, :2].max(axis=0) - origin) / cells, 1e-9)
+
+    cell_xy = np.clip(((queries[:, :2] - origin) / cell_size).astype(np.int64), 0, cells - 1)
+    cell = cell_xy[:, 1] * cells + cell_xy[:, 0]
+    order = np.argsort(cell, kind="stable")
+    counts = np.bincount(cell, minlength=cells * cells)
+    starts = np.cumsum(counts) - counts
+
+    # One cell of margin, because points on the border of a cell may have been clipped or rounded into it.
+    low = np.clip(np.floor((corners[:, :, :2].min(axis=1) - origin) / cell_size).astype(np.int64), 0, cells)
+    high = np.clip(np.floor((corners[:, :, :2].max(axis=1) - origin) / cell_size).astype(np.int64) + 1, 0, cells)
+    low = np.minimum(low, cells - 1)
+    top = corners[:, :, 2].max(axis=1)
+    for face, x, y in pairs(low, np.maximum(high, low + 1)):
+        occupied = counts[y * cells + x]
+        pair_face = np.repeat(face, occupied)
+        first = np.repeat(starts[y * cells + x], occupied)
+        within = np.arange(len(pair_face)) - np.repeat(np.cumsum(occupied) - occupied, occupied)
+        query = order[first + within]
+        above = top[pair_face] > queries[query, 2]
+        pair_face, query = pair_face[above], query[above]
+        blocked[query[_is_under(corners[pair_face], queries[query])]] = True
+    return blocked
+
+
+def _is_under(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether a ray from each point [n, 3] along +z hits its triangle [n, 3, 3]."""
+    x, y = (triangles[:, :, axis] - points[:, axis, None] for axis in (0, 1))
+    # e[k] belongs to the edge from corner k + 1 to corner k + 2, opposite to corner k.
+    e = [x[:, i] * y[:, j] - y[:, i] * x[:, j] for i, j in ((1, 2), (2, 0), (0, 1))]
+    total = e[0] + e[1] + e[2]
+    z = (e[0] * triangles[:, 0, 2] + e[1] * triangles[:, 1, 2] + e[2] * triangles[:, 2, 2]) / np.where(
+        total == 0, 1, total
+    )
+    return same_sign(*e) & (total != 0) & (z > points[:, 2])
+
+
+def _frame(direction: np.ndarray) -> np.ndarray:
+    """Return a right-handed frame [3, 3] whose last row is the unit ``direction``."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    across = np.cross(helper, direction)
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(direction, across), direction])
