@@ -65,7 +65,7 @@ def test_default_voxels_grow_until_the_volume_fits(run: Path, tmp_path: Path, mo
 
 def test_training_with_little_memory_uses_larger_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Training and meshing in one command: the depth maps kept by scoring are closed once the smaller voxels failed."""
-    monkeypatch.setattr("gs2d.pipeline.finish.run_mesh._volume_bytes", lambda _options: 400 << 10)
+    monkeypatch.setattr("gs2d.pipeline.finish.run_mesh.memory_budget", lambda: 400 << 10)
     capture, heard = write_capture(tmp_path / "ball", size=32), list[Event]()
     overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
     run = train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.002, threads=1,

@@ -24,6 +24,11 @@ ACTIONS: Registry[Any] = Registry(
 def register_action(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers an entry action, so that a stage can use ``Action(name, options)``.
 
+    Parameters
+    ----------
+    name : str
+        Must not be taken.
+
     Returns
     -------
     callable

@@ -23,6 +23,11 @@ DENSIFIERS: Registry[Any] = Registry(
 def register_densifier(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a densifier, so that a stage can use ``Densify(name, options)``.
 
+    Parameters
+    ----------
+    name : str
+        Must not be taken.
+
     Returns
     -------
     callable

@@ -28,6 +28,11 @@ LEAST_START = 200  # iterations without learned quantities that a shorter schedu
 def register_quantity(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a learned quantity, so that ``Recipe.learned`` can name it.
 
+    Parameters
+    ----------
+    name : str
+        Must not be taken.
+
     Returns
     -------
     callable

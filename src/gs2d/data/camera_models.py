@@ -120,6 +120,11 @@ CAMERA_MODELS: Registry[Callable[[], CameraModel]] = Registry(
 def register_camera_model(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a camera model, for ``Lens.kind`` and ``camera_model`` in ``transforms.json``.
 
+    Parameters
+    ----------
+    name : str
+        Must not be taken.
+
     Returns
     -------
     callable

@@ -49,6 +49,11 @@ EVALUATORS: Registry[Callable[[], Evaluator]] = Registry("evaluator", "gs2d.eval
 def register_evaluator(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers an evaluator of surfaces for ``gs2d evaluate``.
 
+    Parameters
+    ----------
+    name : str
+        Name of the evaluator; must not be taken.
+
     Returns
     -------
     callable

@@ -44,6 +44,11 @@ BACKENDS: Registry[Callable[[], Backend]] = Registry(
 def register_backend(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a rasterizer backend for ``backend=name``.
 
+    Parameters
+    ----------
+    name : str
+        Must not be taken.
+
     Returns
     -------
     callable

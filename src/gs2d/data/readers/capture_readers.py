@@ -42,6 +42,11 @@ READERS: Registry[Callable[[], Reader]] = Registry("format", "gs2d.readers", bui
 def register_reader(name: str) -> Callable[[Register], Register]:
     """Return a decorator that registers a reader of captures, so that ``load_scene`` recognises its format.
 
+    Parameters
+    ----------
+    name : str
+        Name of the format, also for ``--format``; must not be taken.
+
     Returns
     -------
     callable
