@@ -264,6 +264,7 @@ template <class T> inline T atomicAdd(T* p, T v) {
     *p = old + v;
     return old;
 }
+inline void __threadfence() {}  // blocks run one after another
 inline int __popc(unsigned v) { return __builtin_popcount(v); }
 inline int __ffs(int v) { return __builtin_ffs(v); }
 inline int __float_as_int(float v) { return emulator::from_bits<int>(emulator::to_bits(v)); }

@@ -35,6 +35,8 @@ from gs2d.render.cuda_works import (
     emit,
     find_ranges,
     order_tiles,
+    piece_buffers,
+    piece_words,
     project,
     see,
     splat_gradients,
@@ -93,6 +95,8 @@ class ForwardState:
         Each tile's range of ``entries``.
     tiles : Tensor [tiles] int32
         Tiles in the order of processing: most entries first.
+    pieces : Tensor [words] float32
+        Memory of the pieces of long lists.
     seen : Tensor [words, 8] int32
         Whether a live pixel of a sub-block uses an entry, one bit each.
     images : dict of Tensor
@@ -112,6 +116,7 @@ class ForwardState:
     entries: Tensor
     ranges: Tensor
     tiles: Tensor
+    pieces: Tensor
     seen: Tensor
     images: dict[str, Tensor]
     radii: Tensor
@@ -187,6 +192,7 @@ def forward(
     exact: bool = True,
     distortion: bool = True,
     transmittance: bool = False,
+    whole_lists: bool = False,
     budget: PairBudget | None = None,
 ) -> ForwardState:
     """Render one view.
@@ -194,6 +200,7 @@ def forward(
     The parameters are contiguous float32 tensors in the order of ``Splats``, on the launcher's device. Without
     ``distortion`` that image is NaN, which saves a tenth of the blending. Without ``transmittance`` the depth by
     transmittance is empty. ``exact=False`` disables culling inside tiles and of splats without an ellipse (tests).
+    ``whole_lists`` cuts no list into pieces, as further channels need it.
     """
     device = parameters[0].device
 
@@ -201,7 +208,7 @@ def forward(
         return torch.empty(shape, dtype=torch.float32, device=device)
 
     projected = _project(launcher, view, parameters, errors=False, exact=exact)
-    found = _bin(launcher, view, projected, exact, budget)
+    found = _bin(launcher, view, projected, exact, budget, whole_lists=whole_lists)
     words = (len(found["entries"]) >> 5) + len(found["tiles"]) + 1
     found |= {"records": projected["records"], "seen": torch.empty(words, 8, dtype=torch.int32, device=device)}
     H, W, tiles = int(view.height), int(view.width), len(found["tiles"])
@@ -210,7 +217,9 @@ def forward(
     if not distortion:
         images["distortion"].fill_(math.nan)
     lists = {name: found[name] for name in LISTS}
-    _run(launcher, view, blend(tiles, lists, images, distortion=distortion))
+    pieces = piece_buffers(found["pieces"], len(found["pieces"]))
+    for work in blend(tiles, lists, images, pieces, distortion=distortion):
+        _run(launcher, view, work)
     images |= {name: floats(H, W) if transmittance else floats(0) for name in DEPTH}
     if transmittance:
         more = {"alpha": images["alpha"], "median": images["depth_median"], "slope": images["slope"]}
@@ -240,7 +249,13 @@ def blend_features(launcher: Launcher, frame: ForwardState, values: Tensor, back
 
 
 def _bin(
-    launcher: Launcher, view: KernelView, projected: dict[str, Tensor], exact: bool, budget: PairBudget | None = None
+    launcher: Launcher,
+    view: KernelView,
+    projected: dict[str, Tensor],
+    exact: bool,
+    budget: PairBudget | None = None,
+    *,
+    whole_lists: bool,
 ) -> dict[str, Tensor]:
     """Return the splats of each tile: stable sort by depth, emission of candidate pairs, stable sort by tile."""
     device = projected["records"].device
@@ -267,8 +282,10 @@ def _bin(
         given = {"keys": sorted_keys, "permutation": permutation, "payloads": payloads}
         _run(launcher, view, find_ranges(bits, candidates, given | {"entries": entries, "ranges": ranges}))
     heavy_first = torch.empty(tiles, dtype=torch.int32, device=device)
-    _run(launcher, view, order_tiles(tiles, {"ranges": ranges, "order": heavy_first}))
-    lists = {"entries": entries, "ranges": ranges, "tiles": heavy_first}
+    words = piece_words(0 if whole_lists else candidates)
+    pieces = torch.empty(words, dtype=torch.float32, device=device)
+    _run(launcher, view, order_tiles(tiles, {"ranges": ranges, "order": heavy_first}, piece_buffers(pieces, words)))
+    lists = {"entries": entries, "ranges": ranges, "tiles": heavy_first, "pieces": pieces}
     return lists | {"order": order, "ends": ends, "permutation": permutation}
 
 
@@ -330,6 +347,7 @@ def backward(
         frame.images,
         upstream,
         {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns},
+        piece_buffers(frame.pieces, len(frame.pieces)),
         absolute=probe is not None and probe.shape[1] == 4,
         features=further,
     )
@@ -397,7 +415,7 @@ def errors(
         return torch.empty(0, dtype=torch.float32, device=image.device)
     given: dict[str, Tensor | None] = {"image": image, "mask": mask}
     if occlusion:
-        lists = _bin(launcher, view, projected, True)
+        lists = _bin(launcher, view, projected, True, whole_lists=True)
         units = torch.zeros(count, dtype=torch.int64, device=image.device)
         given |= {name: lists[name] for name in ("entries", "ranges", "tiles")}
         given |= {"records": projected["records"], "errors": units}

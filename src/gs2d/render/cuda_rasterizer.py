@@ -113,6 +113,7 @@ class _CudaRasterize(torch.autograd.Function):
             "exact": options.exact_masks,
             "distortion": options.distortion,
             "transmittance": options.transmittance,
+            "whole_lists": values is not None,
         }
         frame = forward(launcher, view, tensors, **choices, budget=options.budget)
         features, color = None, frame.images["color"]

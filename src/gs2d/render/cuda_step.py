@@ -38,6 +38,8 @@ from gs2d.render.cuda_works import (
     emit,
     find_ranges,
     order_tiles,
+    piece_buffers,
+    piece_words,
     project,
     see,
     splat_gradients,
@@ -440,6 +442,8 @@ class _Plan:
             "ranges": ranges,
         }
         lists |= {"tiles": heavy_first, "seen": seen}
+        words = piece_words(sorting.most_room)
+        pieces = piece_buffers(arena.get("pieces", words, spare=1), words)
         images, upstream = _images(arena, step)
         kept = {name: images[name] for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "final_T")}
         self._losses = _Losses(step, images, upstream)
@@ -447,8 +451,8 @@ class _Plan:
             self._of_room[0],
             *sorting.by_tile(),
             self._of_room[1],
-            order_tiles(tiles, {"ranges": ranges, "order": heavy_first}),
-            blend(tiles, lists, kept, distortion=False),
+            order_tiles(tiles, {"ranges": ranges, "order": heavy_first}, pieces),
+            *blend(tiles, lists, kept, pieces, distortion=False),
             *self._losses.works,
         ]
 
@@ -458,7 +462,7 @@ class _Plan:
             sums["gradients"] = arena.get("gradient_rows", 16 * count, zeros=True)
         found = {"color": images["g_color"], **upstream}
         gradients = {name: arena.get(f"g_{name}", splats[name].numel()) for name in step.learned}
-        blended = blend_gradients(tiles, lists, kept, found, sums, absolute="absolute" in step.gathered)
+        blended = blend_gradients(tiles, lists, kept, found, sums, pieces, absolute="absolute" in step.gathered)
         last = splat_gradients(splats, sums | {"tile_counts": projected["tile_counts"]}, gradients, clears=True)
         if step.gathered and not _only_colors(step):
             names = {"signed_norms": "signed", "absolute_norms": "absolute", "counts": "count"}

@@ -20,6 +20,7 @@ from gs2d.kernels.cuda.kernel_arguments import (
     FeatureBuffers,
     KernelView,
     OrderArguments,
+    PieceBuffers,
     ProjectArguments,
     ProjectColorsArguments,
     ProjectVjpArguments,
@@ -36,6 +37,8 @@ __all__ = [
     "emit",
     "find_ranges",
     "order_tiles",
+    "piece_buffers",
+    "piece_words",
     "project",
     "see",
     "splat_gradients",
@@ -45,9 +48,12 @@ __all__ = [
 
 THREADS = 128
 ORDER_THREADS = 512  # order.cu
+MOST_PIECES = 1024  # about the number of blocks that a large GPU runs at once
+SHORTEST_PIECE = 128  # entries: 4 chunks, whose blending takes several times as long as adding up the pieces
+PIECE_ROW, PIECE_STATE = 6, 15 * 256  # pixels.h: integers and floats of a piece
 OF_EMISSION = ("width", "height", "tiles_x", "tiles_y", "near")
 
-Pointers: TypeAlias = Mapping[str, Tensor | int | None]
+Pointers: TypeAlias = Mapping[str, Tensor | ctypes.Structure | int | None]
 
 
 def blocks_of(count: int) -> int:
@@ -97,17 +103,34 @@ def find_ranges(bits: int, room: int, pointers: Pointers) -> Work:
     return work_of(f"find_ranges_{bits}", blocks_of(room), RangeArguments(candidates=room), pointers)
 
 
-def order_tiles(tiles: int, pointers: Pointers) -> Work:
-    """Order tiles by their number of pairs, largest first."""
-    work = work_of("order_tiles", 1, OrderArguments(tiles=tiles), pointers)
+def piece_words(room: int) -> int:
+    """Return the memory of the pieces of long lists, in words of 32 bits, for lists of ``room`` pairs in total."""
+    return min(MOST_PIECES, room // SHORTEST_PIECE) * (PIECE_STATE + PIECE_ROW) + 1
+
+
+def piece_buffers(memory: Tensor, words: int) -> PieceBuffers:
+    """Return the structure of the pieces: their states, then their table, in ``words`` as from :func:`piece_words`."""
+    capacity, start = words // (PIECE_STATE + PIECE_ROW), memory.data_ptr()
+    return PieceBuffers(capacity, start + memory.element_size() * PIECE_STATE * capacity, start)
+
+
+def order_tiles(tiles: int, pointers: Pointers, pieces: PieceBuffers | None = None) -> Work:
+    """Order tiles by their number of pairs, largest first, and cut long lists into pieces if there is room for them."""
+    arguments = OrderArguments(tiles=tiles, shortest=SHORTEST_PIECE, most=MOST_PIECES)
+    if pieces is not None:
+        arguments.capacity, arguments.pieces = pieces.capacity, pieces.table
+    work = work_of("order_tiles", 1, arguments, pointers)
     work.threads = ORDER_THREADS
     return work
 
 
-def blend(tiles: int, lists: Pointers, images: Pointers, *, distortion: bool) -> Work:
-    """Blend the images from the lists of all tiles."""
-    name = f"blend_forward{'_distortion' if distortion else ''}"
-    return work_of(name, tiles, BlendArguments(), lists, images)
+def blend(tiles: int, lists: Pointers, images: Pointers, pieces: PieceBuffers, *, distortion: bool) -> list[Work]:
+    """Blend the images from the lists of all tiles; first compute the transmittance of pieces of long lists."""
+    name, capacity = f"blend_forward{'_distortion' if distortion else ''}", int(pieces.capacity)
+    works = [work_of(name, capacity + tiles, BlendArguments(pieces=pieces), lists, images)]
+    if capacity > 0:
+        works.insert(0, work_of("pieces_forward", capacity, BlendArguments(pieces=pieces), lists))
+    return works
 
 
 def blend_gradients(
@@ -116,6 +139,7 @@ def blend_gradients(
     images: Pointers,
     upstream: Pointers,
     sums: Pointers,
+    pieces: PieceBuffers,
     *,
     absolute: bool = False,
     features: FeatureBuffers | None = None,
@@ -131,15 +155,18 @@ def blend_gradients(
         Gradients of the images by name; absent or None: no gradient.
     sums : mapping
         "gradients", "extras", "slots" and "learns"; without "gradients", only colour gradients are computed.
+    pieces : PieceBuffers
+        Pieces of the forward pass, none if there are further channels.
     absolute : bool
         Whether to gather the absolute densification signal.
     features : FeatureBuffers, optional
         Further channels.
     """
+    blocks = tiles + int(pieces.capacity)
     if sums.get("gradients") is None:
         colors = {"g_color": upstream["color"], "gradients": sums["extras"]}
         colors |= {name: sums.get(name) for name in ("learns", "slots")}
-        return work_of("blend_vjp_learning", tiles, BlendColorsArguments(), lists, colors)
+        return work_of("blend_vjp_learning", blocks, BlendColorsArguments(pieces=pieces), lists, colors)
     given = {name: tensor for name, tensor in upstream.items() if tensor is not None}
     distortion, further = "distortion" in given, "depth_transmittance" in given
     if features is not None:
@@ -151,12 +178,12 @@ def blend_gradients(
     else:
         geometry = not given.keys().isdisjoint(("normal", "depth_mean", "depth_median"))
         kind = f"blend_vjp_{'geometry' if geometry else 'color'}"
-    arguments = BlendVjpArguments()
+    arguments = BlendVjpArguments(pieces=pieces)
     if features is not None:
         arguments.features = features
     kept = {name: image for name, image in images.items() if name != "depth_median"}
     gradients = {f"g_{name}": tensor for name, tensor in given.items()}
-    return work_of(f"{kind}{'_abs' if absolute else ''}", tiles, arguments, lists, kept, gradients, sums)
+    return work_of(f"{kind}{'_abs' if absolute else ''}", blocks, arguments, lists, kept, gradients, sums)
 
 
 def splat_gradients(

@@ -23,6 +23,7 @@ NAMES = {  # C++ names that differ
     "FeatureBuffers": "Features",
     "GatheredSignal": "Gathered",
     "DecodedTarget": "Photograph",
+    "PieceBuffers": "Pieces",
 }
 CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "cx", "cy")}  # members of View
 

@@ -26,7 +26,7 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.launch import GpuLauncher, Launcher
-from gs2d.render import cuda_step, pair_budget
+from gs2d.render import cuda_step, cuda_works, pair_budget
 from gs2d.training import objective as views
 from gs2d.training import targets
 from gs2d.training import trainer as loop
@@ -271,9 +271,11 @@ def test_learned_cameras_and_custom_densifiers_train_through_torch(
     assert OfItsOwn.seen == 5
 
 
-@pytest.mark.parametrize("case", ["object", "squares", "silhouettes", "compared later", "in the host's memory"])
+@pytest.mark.parametrize(
+    "case", ["object", "squares", "silhouettes", "compared later", "in the host's memory", "long lists"]
+)
 def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
-    emulator: Emulator, scene: Scene, case: str
+    emulator: Emulator, scene: Scene, case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With images in host memory, if they do not fit on the device."""
     recipe, given, count, options = brief(), scene, 6, {}
@@ -285,6 +287,8 @@ def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
         recipe, given = with_silhouettes(of_object(recipe)), masked(scene)
     elif case == "compared later":
         recipe, count = brief(train_toys.compared()), 5  # active from the seventh iteration on
+    elif case == "long lists":
+        monkeypatch.setattr(cuda_works, "SHORTEST_PIECE", 8)  # lists from 16 entries on are cut
     else:
         options = {"target_bytes": 0}
     parts, _ = trained(emulator, given, recipe, "torch", **options)

@@ -147,6 +147,22 @@ GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_
     return seen;
 }
 
+// Adds the state of the part of the list behind `p`, which began with the transmittance at the end of `p` and with zero
+// sums. Associative; T and median keep the values that the splats left, without the rounding of a product.
+template <class V> GS2D_HD void append(const Pixel<V>& behind, Pixel<V>& p) {
+    p.T = select(behind.alpha > V(0), behind.T, p.T), p.median = select(behind.median > V(0), behind.median, p.median);
+    // The moments behind refer to another first pair.
+    p.inverse_depth0 = select(p.alpha > V(0), p.inverse_depth0, behind.inverse_depth0);
+    const V shift = behind.inverse_depth0 - p.inverse_depth0, twice = fma(V(2) * shift, behind.alpha, behind.M1_twice);
+    const V M2 = fma(shift, fma(shift, behind.alpha, behind.M1_twice), behind.M2);
+    p.distortion = p.distortion + behind.distortion + fma(p.alpha, M2, fma(behind.alpha, p.M2, V(-0.5f) * p.M1_twice * twice));
+    p.M1_twice = p.M1_twice + twice, p.M2 = p.M2 + M2;
+    p.alpha = p.alpha + behind.alpha;
+    p.red = p.red + behind.red, p.green = p.green + behind.green, p.blue = p.blue + behind.blue;
+    p.nx = p.nx + behind.nx, p.ny = p.ny + behind.ny, p.nz = p.nz + behind.nz;
+    p.depth = p.depth + behind.depth;
+}
+
 // Upstream gradient of one pixel and its totals. With s = g . (outputs of one splat), the remaining sum S = sum over
 // later splats of w s gives dL/dalpha = T s - S / (1 - alpha) in a front-to-back pass, without a suffix buffer per
 // channel.

@@ -3,6 +3,10 @@
 // Warps vote only among their own lanes and never wait for each other. In a chunk of 32 entries, each lane reads one
 // entry, the sub-block masks select the splats for the warp, and the selected lanes fetch the records into shared
 // memory. A chunk therefore waits for memory only once.
+//
+// Pieces of a long list are blended at the same time (pixels.h). A first kernel computes the transmittance of each piece
+// but the last, so that every piece starts with the transmittance in front of it and stops where the whole list would.
+// The warp that finishes the last piece of its pixels adds up the sums of the pieces.
 #include "cuda/pixels.h"
 
 namespace gs2d {
@@ -18,6 +22,7 @@ struct BlendArguments {
     float* moments;  // [H, W, 3]: M1, M2, inverse depth of the first pair; written with the distortion
     // [words, 8] or null: bit j of a word is set if a live pixel of the sub-block uses entry j of the chunk
     uint* seen;
+    Pieces pieces;
 };
 
 template <bool DIST>
@@ -37,16 +42,53 @@ __device__ __forceinline__ void write_pixel(const BlendArguments& a, int x, int 
     }
 }
 
-template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments& a, float4 (*records)[32]) {
-    const Place at = place_of(a.view, a.tiles);
+constexpr Pixel<float> FRESH = {1.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, true};
+
+// Stores the sums of a piece. The warp that does so last replaces the sums of each piece by those of the pieces in
+// front, for the backward pass, and writes the pixels.
+template <bool DIST>
+__device__ __forceinline__ void finish_piece(const BlendArguments& a, Pixel<float> (&p)[HALVES]) {
+#pragma unroll
+    for (int h = 0; h < HALVES; ++h)
+        for_each_sum<DIST>(p[h], [&](int k, float v) { state_of(a.pieces, blockIdx.x, k, h) = v; });
+    __threadfence();
+    __syncwarp();
+    const Part part = part_of(a.pieces, a.ranges, a.tiles);  // again, which saves registers
+    const Place at = place_of(a.view, part.tile);
+    int finished = 0;
+    if (at.lane == 0) finished = 1 + atomicAdd(a.pieces.table + PIECE_ROW * part.first + 2 + at.warp, 1);
+    if (!__any_sync(FULL_MASK, finished == part.pieces)) return;
+    __threadfence();
+#pragma unroll 1  // saves registers
+    for (int h = 0; h < HALVES; ++h) {
+        Pixel<float> sum = FRESH;
+        for (int piece = part.first; piece < part.first + part.pieces; ++piece) {
+            Pixel<float> next = FRESH;
+            for_each_sum<DIST>(next, [&](int k, float& v) { v = state_of(a.pieces, piece, k, h); });
+            for_each_sum<DIST>(sum, [&](int k, float v) { state_of(a.pieces, piece, k, h) = v; });
+            append(next, sum);
+        }
+        const int y = at.y + 4 * h;
+        if (at.x < a.view.width && y < a.view.height) write_pixel<DIST>(a, at.x, y, sum);
+    }
+}
+
+// ONLY_T: compute the transmittance of the previous piece.
+template <bool DIST, bool ONLY_T = false>
+__device__ __forceinline__ void blend(const BlendArguments& a, float4 (*records)[32]) {
+    const Part part = part_of(a.pieces, a.ranges, a.tiles, ONLY_T);
+    if (part.tile < 0) return;
+    const Place at = place_of(a.view, part.tile);
     const BlendLimits<float> limits = limits_of(a.view);
     Pixel<float> p[HALVES];
 #pragma unroll
-    for (int h = 0; h < HALVES; ++h)
-        p[h] = {1.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, at.inside[h]};
+    for (int h = 0; h < HALVES; ++h) {
+        p[h] = FRESH;
+        if (!ONLY_T) p[h].T = in_front(a.pieces, part, h, limits.transmittance_min);
+        p[h].live = at.inside[h] && p[h].T > 0.f;
+    }
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
-    const int64 begin = a.ranges[2 * int64(at.tile)];
-    const int count = int(a.ranges[2 * int64(at.tile) + 1] - begin);
+    const int begin = part.begin, count = part.count;
 
     int chunk = 0;
     for (; 32 * chunk < count; ++chunk) {
@@ -78,13 +120,18 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;  // uniform over the warp
                 const Hit<float> hit = hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits);
-                const bool saw = composite(s, hit.alpha, hit.depth, hit.inverse_depth, limits, p[h]);
-                seen[h] |= saw ? bit : 0u;
+                if constexpr (ONLY_T) {
+                    pass_weight(hit, limits, p[h].T);
+                    p[h].live = p[h].T > 0.f;
+                } else {
+                    const bool saw = composite(s, hit.alpha, hit.depth, hit.inverse_depth, limits, p[h]);
+                    seen[h] |= saw ? bit : 0u;
+                }
             }
         });
         __syncwarp();  // the records are overwritten in the next iteration
-        if (a.seen) {
-            const int64 words = word_of(begin, at.tile, chunk);
+        if (!ONLY_T && a.seen) {
+            const int64 words = word_of(begin, part.tile, chunk);
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 const uint word = or_over_warp(seen[h]);
@@ -92,22 +139,31 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
             }
         }
     }
+    if constexpr (ONLY_T) {
+#pragma unroll
+        for (int h = 0; h < HALVES; ++h) state_of(a.pieces, blockIdx.x, 0, h) = p[h].T;
+        return;
+    }
     if (a.seen)  // no pixel uses entries behind the last live one
         for (chunk += at.lane; 32 * chunk < count; chunk += 32)
 #pragma unroll
-            for (int h = 0; h < HALVES; ++h) a.seen[word_of(begin, at.tile, chunk) + at.sub_block[h]] = 0u;
+            for (int h = 0; h < HALVES; ++h) a.seen[word_of(begin, part.tile, chunk) + at.sub_block[h]] = 0u;
+    if (blockIdx.x < a.pieces.capacity) return finish_piece<DIST>(a, p);
 #pragma unroll
     for (int h = 0; h < HALVES; ++h)
         if (at.inside[h]) write_pixel<DIST>(a, at.x, at.y + 4 * h, p[h]);
 }
 
-// Minimum blocks per multiprocessor: 8 would leave 64 registers per thread, with which sm_75 and sm_80 spill.
+// Minimum blocks per multiprocessor: 8 would leave 64 registers per thread, with which sm_75 and sm_80 spill. With the
+// distortion, sm_120 spills at 72.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
-constexpr int BLOCKS = 6;
+constexpr int BLOCKS = 6, BLOCKS_DISTORTION = 5;
 #elif defined(__CUDA_ARCH__) && __CUDA_ARCH__ == 800
-constexpr int BLOCKS = 7;
+constexpr int BLOCKS = 7, BLOCKS_DISTORTION = 6;
+#elif defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 1200
+constexpr int BLOCKS = 8, BLOCKS_DISTORTION = 6;
 #else
-constexpr int BLOCKS = 8;
+constexpr int BLOCKS = 8, BLOCKS_DISTORTION = 7;
 #endif
 
 // The distortion's three moments cost registers and time; without it `distortion` and `moments` are not written.
@@ -116,9 +172,14 @@ extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_forward(BlendArg
     blend<false>(a, records[threadIdx.x >> 5]);
 }
 
-extern "C" __global__ void __launch_bounds__(128, BLOCKS - 1) blend_forward_distortion(BlendArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS_DISTORTION) blend_forward_distortion(BlendArguments a) {
     __shared__ float4 records[4][4][32];
     blend<true>(a, records[threadIdx.x >> 5]);
+}
+
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) pieces_forward(BlendArguments a) {
+    __shared__ float4 records[4][4][32];
+    blend<false, true>(a, records[threadIdx.x >> 5]);
 }
 
 }  // namespace gs2d

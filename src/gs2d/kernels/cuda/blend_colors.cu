@@ -18,6 +18,7 @@ struct BlendColorsArguments {
     const float* g_color;  // [H, W, 3]
     const int64* slots;    // as in blend_vjp.cu
     float* gradients;      // [N, 4]: colours and padding; zeros on entry; with slots [4 * candidates, 4]
+    Pieces pieces;         // of the forward pass
 };
 
 struct ProjectColorsArguments {
@@ -34,7 +35,9 @@ struct ProjectColorsArguments {
 extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendColorsArguments a) {
     __shared__ float4 staged[4][4][32];  // warp, quarter of a record, entry
     __shared__ uint rows[4][32];
-    const Place at = place_of(a.view, a.tiles);
+    const Part part = part_of(a.pieces, a.ranges, a.tiles);
+    if (part.tile < 0) return;
+    const Place at = place_of(a.view, part.tile);
     float4(*records)[32] = staged[at.warp];
     const BlendLimits<float> limits = limits_of(a.view);
     Vec3<float> g[HALVES];
@@ -42,11 +45,11 @@ extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendCol
 #pragma unroll
     for (int h = 0; h < HALVES; ++h) {
         const float* from = a.g_color + 3 * (int64(at.y + 4 * h) * a.view.width + at.x);
-        T[h] = at.inside[h] ? 1.f : 0.f;
+        T[h] = at.inside[h] ? in_front(a.pieces, part, h, limits.transmittance_min) : 0.f;
         g[h] = at.inside[h] ? Vec3<float>{from[0], from[1], from[2]} : Vec3<float>{0.f, 0.f, 0.f};
     }
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
-    const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];
+    const int64 begin = part.begin, end = begin + part.count;
     const auto learning = [&](int64 i, uint wanted) {  // returns which entries of the chunk are trained
         const bool mine = wanted >> at.lane & 1u && (!a.learns || a.learns[a.entries[i + at.lane] >> 8]);
         return __ballot_sync(FULL_MASK, mine);

@@ -24,6 +24,7 @@ struct BlendVjpArguments {
     float* extras;        // low-pass centre and absolute densification signal: 4 columns, same rows as `gradients`
     const float *depth_transmittance, *slope, *g_depth_transmittance;  // from transmittance.cu; TRANS only
     Features features;  // FEAT only: `learns` is null; with slots features.gradients is [4 * candidates, F]
+    Pieces pieces;      // of the forward pass; FEAT needs whole lists
 };
 
 // Returns a value of a plane, 0 if the plane is null.
@@ -66,6 +67,17 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
         g.inverse_depth0 = a.moments[3 * i + 2];
     }
     return g;
+}
+
+// Returns the sum of w s over the splats in front of this block's piece.
+template <bool GEO, bool DIST>
+__device__ __forceinline__ float sum_in_front(const Pieces& pieces, int h, const PixelGradient<float>& g) {
+    Pixel<float> p;
+    for_each_sum<DIST>(p, [&](int k, float& v) { v = state_of(pieces, blockIdx.x, k, h); });
+    float S = fma(g.red, p.red, fma(g.green, p.green, fma(g.blue, p.blue, g.alpha * p.alpha)));
+    if constexpr (GEO) S = fma(g.nx, p.nx, fma(g.ny, p.ny, fma(g.nz, p.nz, fma(g.depth, p.depth, S))));
+    if constexpr (DIST) S = fma(g.distortion2, p.M2, fma(g.distortion1, 0.5f * p.M1_twice, S));
+    return S;
 }
 
 // `row` is the splat, or with slots the slot of this entry and warp.
@@ -193,7 +205,10 @@ __device__ __forceinline__ void add_features(const BlendVjpArguments& a, const P
 template <bool GEO, bool DIST, bool ABS, bool TRANS = false, bool FEAT = false>
 __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream<GEO, TRANS>& upstream,
                                           PairValues pairs = nullptr) {
-    const Place at = place_of(a.view, a.tiles);
+    const Pieces pieces = FEAT ? Pieces{} : a.pieces;
+    const Part part = part_of(pieces, a.ranges, a.tiles);
+    if (part.tile < 0) return;
+    const Place at = place_of(a.view, part.tile);
     const BlendLimits<float> limits = limits_of(a.view);
     PixelGradient<float> g[HALVES];  // registers hold only members that are not in `upstream`
     float T[HALVES], S[HALVES];
@@ -201,18 +216,18 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
     for (int h = 0; h < HALVES; ++h) {
         g[h] = {}, T[h] = 0.f, S[h] = 0.f;
         if (at.inside[h]) {
-            T[h] = 1.f;
+            T[h] = in_front(pieces, part, h, limits.transmittance_min);
             g[h] = upstream_of<GEO, DIST, TRANS, FEAT>(a, int64(at.y + 4 * h) * a.view.width + at.x, S[h]);
+            if (part.pieces > 1) S[h] = S[h] - sum_in_front<GEO, DIST>(pieces, h, g[h]);
         }
         upstream.put(h, g[h]);
     }
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
-    const int64 begin = a.ranges[2 * int64(at.tile)];
-    const int count = int(a.ranges[2 * int64(at.tile) + 1] - begin);
+    const int begin = part.begin, count = part.count;
 
     for (int chunk = 0; 32 * chunk < count; ++chunk) {
-        const int64 i = begin + 32 * chunk;
-        const uint* words = a.seen + word_of(begin, at.tile, chunk);
+        const int i = begin + 32 * chunk;
+        const uint* words = a.seen + word_of(begin, part.tile, chunk);
         const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane), uniform(words[at.sub_block[1]], at.lane)};
         const uint wanted = hits[0] | hits[1];
         if (wanted == 0u) continue;  // uniform over the warp
@@ -268,27 +283,34 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
     }
 }
 
+// Minimum blocks per multiprocessor; sm_75 has shared memory for three or four.
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
+constexpr int BLOCKS = 4;
+#else
+constexpr int BLOCKS = 7;
+#endif
+
 // Outputs with gradients: GEO: normal or depth images (or the distortion, DIST); TRANS: depth by transmittance; FEAT:
 // further channels. ABS: computes the AbsGS signal.
-extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_vjp_color(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<false> upstream;
     blend_vjp<false, false, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color_abs(BlendVjpArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_vjp_color_abs(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<false> upstream;
     blend_vjp<false, false, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_geometry(BlendVjpArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_vjp_geometry(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<true> upstream;
     blend_vjp<true, false, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_geometry_abs(BlendVjpArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_vjp_geometry_abs(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<true> upstream;
     blend_vjp<true, false, true>(a, staged[threadIdx.x >> 5], upstream);

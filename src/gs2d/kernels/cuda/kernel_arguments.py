@@ -32,6 +32,7 @@ __all__ = [
     "OrderArguments",
     "PhotometricArguments",
     "PhotometricVjpArguments",
+    "PieceBuffers",
     "ProjectArguments",
     "ProjectColorsArguments",
     "ProjectVjpArguments",
@@ -45,8 +46,8 @@ __all__ = [
 _Field = tuple[str, type]
 
 
-def fill(arguments: ctypes.Structure, **pointers: Tensor | int | None) -> None:
-    """Set pointers of a structure to tensors, addresses or null."""
+def fill(arguments: ctypes.Structure, **pointers: Tensor | ctypes.Structure | int | None) -> None:
+    """Set pointers of a structure to tensors, addresses or null, and members to structures."""
     for name, pointer in pointers.items():
         setattr(arguments, name, pointer.data_ptr() if isinstance(pointer, Tensor) else pointer)
 
@@ -106,7 +107,18 @@ class RangeArguments(ctypes.Structure):
 class OrderArguments(ctypes.Structure):
     """Arguments of order.cu."""
 
-    _fields_ = (("tiles", ctypes.c_int64), *_pointers("ranges", "order"))
+    _fields_ = (
+        ("tiles", ctypes.c_int64),
+        *_pointers("ranges", "order"),
+        *_all(ctypes.c_int64, "capacity", "shortest", "most"),
+        *_pointers("pieces"),
+    )
+
+
+class PieceBuffers(ctypes.Structure):
+    """``struct Pieces`` of pixels.h."""
+
+    _fields_ = (("capacity", ctypes.c_int64), *_pointers("table", "states"))
 
 
 class BlendArguments(ctypes.Structure):
@@ -115,6 +127,7 @@ class BlendArguments(ctypes.Structure):
     _fields_ = (
         ("view", KernelView),
         *_pointers("records", "entries", "ranges", "tiles", *IMAGES, "final_T", "moments", "seen"),
+        ("pieces", PieceBuffers),
     )
 
 
@@ -147,6 +160,7 @@ class BlendVjpArguments(ctypes.Structure):
         *_pointers(*(f"g_{name}" for name in IMAGES), "learns", "slots", "gradients", "extras"),
         *_pointers("depth_transmittance", "slope", "g_depth_transmittance"),
         ("features", FeatureBuffers),
+        ("pieces", PieceBuffers),
     )
 
 
@@ -175,6 +189,7 @@ class BlendColorsArguments(ctypes.Structure):
     _fields_ = (
         ("view", KernelView),
         *_pointers("records", "entries", "ranges", "tiles", "seen", "learns", "g_color", "slots", "gradients"),
+        ("pieces", PieceBuffers),
     )
 
 
