@@ -146,7 +146,9 @@ def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
             mask=torch.rand(height, width, generator=g) < 0.8,
             valid=height * width,
             background=(0.1, 0.5, 0.2),
-            losses=StepLosses(0.8, 0.2, normals=StepNormals(0.05, "mean", False, True, flat=3.0), **more),
+            losses=StepLosses(
+                0.8, 0.2, normals=StepNormals(0.05, "mean", False, True, flat=3.0), smooth_normals=0.8, **more
+            ),
             rows=None if names is None else torch.arange(count) % 3 == 0,
             learned=learned,
             betas=(0.9, 0.999, 1e-15),

@@ -129,6 +129,31 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
                 assert relative_error(f, e) < 5e-6
 
 
+def smoothness_inputs(size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return normals, alpha, flatness and mask."""
+    normal, _, alpha, mask = geometry(*size)
+    flatness = torch.randint(0, 256, size, generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    return normal.float(), alpha.float(), flatness, mask
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", [*SIZES, (9, 33)])
+def test_normal_smoothness_and_its_gradient_are_those_of_the_reference(
+    library: Library, size: tuple[int, int], masked: bool
+) -> None:
+    normal, alpha, flatness, mask = smoothness_inputs(size)
+    given = (alpha, flatness, mask if masked else None)
+    normal.requires_grad_()
+    exact_normal = normal.detach().double().requires_grad_()
+    value = ops.normal_smoothness(normal, *given, expected=0.8, library=library)
+    exact = reference.normal_smoothness(exact_normal, *given)
+    assert value.item() == pytest.approx(exact.item(), abs=1e-6)
+    for cotangent in (0.8, 3.0):  # the first matches the gradient computed in the forward pass
+        (found,) = torch.autograd.grad(value, normal, torch.tensor(cotangent), retain_graph=True)
+        (expected,) = torch.autograd.grad(exact, exact_normal, torch.tensor(cotangent).double(), retain_graph=True)
+        assert relative_error(found, expected) < 5e-6
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_the_masked_mean_and_its_gradient_are_those_of_the_reference(library: Library, size: tuple[int, int]) -> None:
     _, _, values, mask = geometry(*size)

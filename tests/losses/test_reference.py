@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -176,6 +177,21 @@ def test_flatness_is_high_without_texture_and_low_with_it() -> None:
         window = grey[max(y - 3, 0) : y + 4, max(x - 3, 0) : x + 4]
         assert abs(int(found[y, x]) - 255 * np.exp(-window.var() / 0.02**2)) <= 0.5 + 1e-6
     assert found[:, 13:].float().mean() < 220
+
+
+def test_normal_smoothness_is_the_bend_between_opaque_pixels_without_texture() -> None:
+    normal = torch.zeros(6, 8, 3, dtype=torch.float64)
+    normal[..., 2] = -1
+    normal[:, 4:] = torch.tensor([-1.0, 0, 0])  # an edge: two columns on each side are compared across it
+    alpha, flat = torch.ones(6, 8, dtype=torch.float64), torch.full((6, 8), 255, dtype=torch.uint8)
+    bend = 2 * 6 * (math.sqrt(2 + reference.SMOOTH_BEND**2) - reference.SMOOTH_BEND) / 48
+    assert reference.normal_smoothness(normal, alpha, flat).item() == pytest.approx(bend)
+    half = torch.where(torch.arange(6)[:, None] < 3, flat, 0)
+    assert reference.normal_smoothness(normal, alpha, half).item() == pytest.approx(bend / 2)
+    assert reference.normal_smoothness(normal, 0.5 * alpha, flat).item() == 0  # not opaque
+    mask = (torch.arange(8) < 4).expand(6, 8)
+    normal[:, 6] = torch.nan  # ignored
+    assert reference.normal_smoothness(normal, alpha, flat, mask).item() == 0
 
 
 def test_flat_weights_go_from_one_to_the_factor() -> None:

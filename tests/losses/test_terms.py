@@ -44,7 +44,8 @@ def one_loss(
 ) -> Tensor:
     """Return a loss of weight 1; the silhouette is the target's first channel, the second view a shifted target."""
     terms, neighbour = [LossTerm(kind, 1.0)], one_neighbour(target, mask, camera)
-    view = LossView(target, camera, mask, index=0, depth_kind=depth, silhouette=target[..., 0], neighbour=neighbour)
+    of_image = {"silhouette": target[..., 0], "flatness": (255 * target[..., 1]).to(torch.uint8)}
+    view = LossView(target, camera, mask, index=0, depth_kind=depth, neighbour=neighbour, **of_image)
     losses = Losses(terms)
     if kind in PRIORS:
         losses[terms[0]]._priors = OnePrior(target)  # type: ignore[attr-defined]

@@ -10,7 +10,8 @@ from gs2d.errors import RecipeError
 
 MODULES = {
     "gs2d.losses.view_terms": (
-        *("l1", "ssim", "l2", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
+        *("l1", "ssim", "l2", "normal_consistency", "normal_consistency_per_splat", "normal_smoothness"),
+        *("distortion", "silhouette"),
         *("multiview_photometric", "multiview_geometric"),
     ),
     "gs2d.losses.prior_terms": ("depth_prior", "normal_prior"),

@@ -44,6 +44,7 @@ SILHOUETTE = 0.1  # weight of the silhouette loss: docs/notebook/losses.md
 # Weight of normal consistency in best, and in best without L2: docs/notebook/losses.md
 BEST_NC, NC_WITHOUT_SQUARES = 0.035, 0.02
 FLAT_FACTOR = 3.0  # of that weight where photographs have no texture: docs/notebook/best.md
+SMOOTHNESS = 0.8  # weight of normal smoothness, which has no effect on texture: docs/notebook/best.md
 SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and the fraction of iterations before it: the same page
 SH_FASTER = 2.5  # factor of the official rate of SH beyond degree 0: docs/notebook/training.md
 SETTLING, SETTLED = 0.3, 0.1  # last fraction of iterations in which rates fall, and final factor: training.md
@@ -209,18 +210,20 @@ def best(
     Not in the paper. A good start needs no opacity resets and fewer iterations, with larger rates. Large splats stay,
     because they represent the surroundings. A silhouette loss uses the alpha of the images, L2 is active after
     densification, and the mesh uses the transmittance depth (docs/notebook/best.md). ``nc`` is the weight of normal
-    consistency, which is heavier where photographs have no texture, ``squares`` that of L2 (0 leaves it out).
+    consistency, which is heavier where photographs have no texture; there normals are smooth, too. ``squares`` is that of L2 (0 leaves it out).
     View-dependent colours learn faster than in 2DGS, except with few images (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
     smooth = {"where": "object", "flat": FLAT_FACTOR}
-    consistency = LossTerm("normal_consistency", nc, round(NC_START * part), options=smooth)
+    start_normals = round(NC_START * part)
+    consistency = LossTerm("normal_consistency", nc, start_normals, options=smooth)
+    smoothness = LossTerm("normal_smoothness", SMOOTHNESS, start_normals)
     silhouette = LossTerm("silhouette", SILHOUETTE, options={"required": False})
     l2 = (LossTerm("l2", squares, round(SQUARES_START * iterations)),) if squares > 0 else ()
     stage = Stage(
         "surface",
         iterations,
-        losses=(*PHOTOMETRIC, *l2, consistency, silhouette),
+        losses=(*PHOTOMETRIC, *l2, consistency, smoothness, silhouette),
         lr=_best_rates(iterations),
         densify=GradDensify(
             start=round(500 * part), stop=round(15_000 * part), reset_every=0, scale_cull_start=iterations

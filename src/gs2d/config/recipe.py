@@ -36,7 +36,8 @@ class LossTerm:
     ----------
     kind : str
         "l1", "ssim" (1 - SSIM), "l2" (mean squared difference), "normal_consistency", "normal_consistency_per_splat"
-        (the paper's Eq. 7), "distortion" or "silhouette" (alpha compared with that of the images). In recipes with
+        (the paper's Eq. 7), "normal_smoothness" (where images have no texture), "distortion" or "silhouette" (alpha
+        compared with that of the images). In recipes with
         ``multiview``: "multiview_photometric" (1 - NCC of warped patches) and "multiview_geometric" (round trip, px);
         with ``depth_prior``: "depth_prior" (relative error of depth); with ``normal_prior``: "normal_prior"
         (1 - cosine). Or a registered loss (docs/extending.md).

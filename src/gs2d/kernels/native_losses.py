@@ -26,6 +26,7 @@ SIGNATURES: dict[str, list[Any]] = {
     "gs2d_photometric": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] * 3 + [POINTER] * 2,
     "gs2d_blur": [POINTER] + [INT64] * 2 + [POINTER],
     "gs2d_masked_mean": [POINTER] * 2 + [INT64] * 2 + [POINTER],
+    "gs2d_normal_smoothness": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] + [POINTER] * 2,
     "gs2d_normal_consistency": [POINTER] * 7 + [INT64] * 2 + [INT, INT, DOUBLE] + [POINTER] * 4,
 }
 
@@ -36,7 +37,7 @@ class LossOperations:
 
     Attributes
     ----------
-    photometric, normal_consistency, masked_mean : callable
+    photometric, normal_consistency, normal_smoothness, masked_mean : callable
     blur : callable or None
         Computes the local mean of the target for ``photometric``; None: caching it does not save time.
     compare_views : callable or None
@@ -45,6 +46,7 @@ class LossOperations:
 
     photometric: Callable[..., tuple[Tensor, Tensor, Tensor]]
     normal_consistency: Callable[..., Tensor]
+    normal_smoothness: Callable[..., Tensor]
     masked_mean: Callable[..., Tensor]
     blur: Callable[[Tensor], Tensor] | None = None
     compare_views: Callable[..., tuple[Tensor, Tensor]] | None = None
@@ -238,10 +240,15 @@ class _NormalConsistency(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        gradients = ctx.saved_tensors
-        if not torch.equal(cotangent, torch.tensor(ctx.expected, dtype=torch.float64).to(cotangent.dtype)):
-            gradients = tuple(None if g is None else g * (cotangent / ctx.expected) for g in gradients)
-        return (*gradients, *[None] * 4)
+        return (*_as_expected(ctx, cotangent), *[None] * 4)
+
+
+def _as_expected(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+    """Return the saved gradients, multiplied if the cotangent is not ``ctx.expected``."""
+    gradients: tuple[Tensor | None, ...] = ctx.saved_tensors
+    if torch.equal(cotangent, torch.tensor(ctx.expected, dtype=torch.float64).to(cotangent.dtype)):
+        return gradients
+    return tuple(None if g is None else g * (cotangent / ctx.expected) for g in gradients)
 
 
 def normal_consistency(
@@ -278,6 +285,77 @@ def normal_consistency(
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
     how = replace(how, mask=_mask_bytes(how.mask), weights=weights)
     value: Tensor = _NormalConsistency.apply(*images, how, expected, needs_gradient(normal, depth, alpha), library)
+    return value
+
+
+class _NormalSmoothness(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        normal: Tensor,
+        alpha: Tensor,
+        flatness: Tensor,
+        mask: Tensor | None,
+        expected: float,
+        wanted: bool,
+        library: Library,
+    ) -> Tensor:
+        gradient = torch.empty_like(normal) if wanted else None
+        value = torch.empty(1, dtype=torch.float64)
+        ctx.expected = expected if expected != 0 else 1.0
+        inputs = (normal, alpha, flatness, mask, *alpha.shape, ctx.expected)
+        _call(library, "gs2d_normal_smoothness", *inputs, gradient, value)
+        ctx.save_for_backward(gradient)
+        return value[0].to(normal.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        return (_as_expected(ctx, cotangent)[0], *[None] * 6)
+
+
+def check_smoothness(normal: Tensor, alpha: Tensor, flatness: Tensor, mask: Tensor | None) -> None:
+    """Raise ShapeError if the inputs of ``normal_smoothness`` do not fit together."""
+    shapes = {"normal": (normal, "H W 3"), "alpha": (alpha, "H W"), "flatness": (flatness, "H W")}
+    check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
+    if flatness.dtype != torch.uint8 or flatness.device != normal.device:
+        raise ShapeError(f"flatness must be uint8 on {normal.device}, got {flatness.dtype} on {flatness.device}")
+
+
+def normal_smoothness(
+    normal: Tensor,
+    alpha: Tensor,
+    flatness: Tensor,
+    mask: Tensor | None = None,
+    *,
+    expected: float = 1.0,
+    library: Library | None = None,
+) -> Tensor:
+    """Return the native form of ``losses.formulas.normal_smoothness``.
+
+    Parameters
+    ----------
+    normal : Tensor [H, W, 3]
+        sum w n, world frame.
+    alpha : Tensor [H, W]
+        A constant.
+    flatness : Tensor [H, W] uint8
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+    expected : float
+        Expected cotangent; another one costs a multiplication of the gradient.
+    library : Library, optional
+
+    Raises
+    ------
+    ShapeError
+        If shapes differ, or a tensor has another dtype or device than the library.
+    """
+    library = library or ready_library()
+    check_smoothness(normal, alpha, flatness, mask)
+    _, alpha = library.arrays(normal=normal, alpha=alpha)
+    given = (normal.contiguous(), alpha.detach(), flatness.contiguous(), _mask_bytes(mask))
+    value: Tensor = _NormalSmoothness.apply(*given, expected, needs_gradient(normal), library)
     return value
 
 

@@ -21,6 +21,8 @@ WINDOW_SIGMA = 1.5  # px
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 FLAT_RADIUS = 3  # px: windows of 7 x 7, as those that views are compared by
+SMOOTH_REACH = 2  # px between compared normals: the noise of neighbouring pixels is the same
+SMOOTH_BEND = 0.01  # radians: smaller bends count quadratically
 FLAT_CONTRAST = 0.02  # standard deviation in [0, 1]: three times the noise of a photograph in daylight
 
 
@@ -203,6 +205,41 @@ def flatness(image: Tensor) -> Tensor:
 
     variance = (mean(grey * grey) - mean(grey).square()).clamp_min(0)[0, 0]
     return (255 * torch.exp(-variance / FLAT_CONTRAST**2)).round().to(torch.uint8)
+
+
+def normal_smoothness(normal: Tensor, alpha: Tensor, flatness: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the mean of f (sqrt(|n - n'|^2 + d^2) - d) over pixels and their neighbours to the right and below.
+
+    Neighbours are ``SMOOTH_REACH`` px apart, and d is ``SMOOTH_BEND``. f is the smaller flatness / 255 of both pixels;
+    0 where the rendered alpha is at most 1/2. It is the total variation of the normals where the image does not say
+    what the surface is: planes stay planes, edges are sharp, and highlights make no pits.
+
+    Parameters
+    ----------
+    normal : Tensor [H, W, 3]
+        sum w n, world frame.
+    alpha : Tensor [H, W]
+        A constant.
+    flatness : Tensor [H, W] uint8
+        :func:`flatness` of the image.
+    mask : Tensor [H, W] bool, optional
+        False = ignore the pixel.
+    """
+    normal = fill_ignored(normal, torch.zeros_like(normal), mask)
+    weights = (alpha.detach() > 0.5) * (flatness.to(normal.dtype) / 255)
+    weights = fill_ignored(weights, torch.zeros_like(weights), mask)
+    values = torch.zeros_like(weights)
+    for axis in (0, 1):
+        difference = normal - _shifted(normal, axis)
+        bend = (difference.square().sum(dim=-1) + SMOOTH_BEND**2).sqrt() - SMOOTH_BEND
+        values = values + torch.minimum(weights, _shifted(weights, axis)) * bend
+    return masked_mean(values, mask)
+
+
+def _shifted(image: Tensor, axis: int) -> Tensor:
+    """Return the values that are ``SMOOTH_REACH`` px further along an axis; 0 outside the image."""
+    kept = image.narrow(axis, min(SMOOTH_REACH, image.shape[axis]), max(image.shape[axis] - SMOOTH_REACH, 0))
+    return torch.cat([kept, torch.zeros_like(image).narrow(axis, 0, image.shape[axis] - kept.shape[axis])], dim=axis)
 
 
 def flat_weights(flat: Tensor, factor: float, dtype: torch.dtype) -> Tensor:

@@ -87,6 +87,12 @@ class L2(_ColorLoss):
         return formulas.l2(output.color, view.target, view.mask)
 
 
+def _normals(output: RenderOutput, view: LossView) -> Tensor:
+    """Return the rendered normals. All turn with the camera, which changes no loss: a learned pose gets no gradient."""
+    pose, normal = view.camera.pose, output.normal
+    return normals_without_pose_grad(output, pose) if pose is not None and normal.requires_grad else normal
+
+
 @register_loss("normal_consistency")
 class NormalConsistency(Loss):
     """1 - alpha <n, N> of rendered normals n and normals N of the depth map, the form of the official 2DGS code.
@@ -125,10 +131,7 @@ class NormalConsistency(Loss):
 
     def _images(self, output: RenderOutput, view: LossView) -> tuple[Tensor, Tensor, Tensor]:
         """Return normals, depth and alpha."""
-        pose, normal = view.camera.pose, output.normal
-        if pose is not None and normal.requires_grad:
-            normal = normals_without_pose_grad(output, pose)  # both normals turn with the camera: nothing changes
-        return normal, output.depth(view.depth_kind), output.alpha
+        return _normals(output, view), output.depth(view.depth_kind), output.alpha
 
     def _plain(self, images: tuple[Tensor, Tensor, Tensor], view: LossView, weights: Tensor | None) -> Tensor:
         form = formulas.normal_consistency_per_splat if self.per_splat else formulas.normal_consistency
@@ -162,6 +165,31 @@ class NormalConsistencyPerSplat(NormalConsistency):
     """The form of the 2DGS paper, Eq. 7: alpha - <n, N>; options as of "normal_consistency"."""
 
     kind, per_splat = "normal_consistency_per_splat", True
+
+
+@register_loss("normal_smoothness", needs=["flatness"])
+class NormalSmoothness(Loss):
+    """Total variation of the rendered normals where the photograph has no texture.
+
+    There colours alone do not determine the surface, and highlights mislead it.
+    """
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return formulas.normal_smoothness(*self._images(output, view), view.mask)
+
+    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
+        """Return the loss by the fused operation."""
+        expected = view.weights.get("normal_smoothness", 1.0)
+        return operations.normal_smoothness(*self._images(output, view), view.mask, expected=expected)
+
+    def in_step(self, term: LossTerm, *, opaque: bool) -> Mapping[str, Any]:
+        """Return the weight."""
+        return {"smooth_normals": float(term.weight or 0.0)}
+
+    @staticmethod
+    def _images(output: RenderOutput, view: LossView) -> tuple[Tensor, Tensor, Tensor]:
+        flatness = formulas.flatness(view.target) if view.flatness is None else view.flatness
+        return _normals(output, view), output.alpha, flatness
 
 
 @register_loss("distortion", needs=["distortion"])

@@ -86,6 +86,7 @@ class CpuBackend(Backend):
         return LossOperations(
             native_losses.photometric,
             native_losses.normal_consistency,
+            native_losses.normal_smoothness,
             native_losses.masked_mean,
             native_losses.blur,
             compare_views,

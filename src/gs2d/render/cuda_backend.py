@@ -100,6 +100,7 @@ class CudaBackend(Backend):
         return LossOperations(
             partial(cuda_losses.photometric, launcher=launcher),
             partial(cuda_losses.normal_consistency, launcher=launcher),
+            partial(cuda_losses.normal_smoothness, launcher=launcher),
             partial(cuda_losses.masked_mean, launcher=launcher),
             compare_views=partial(cuda_multiview.compare_views, launcher=launcher),
         )

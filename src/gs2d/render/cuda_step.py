@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gs2d.kernels.cuda import kernel_arguments as structures
-from gs2d.kernels.cuda.cuda_losses import NORMAL_H, NORMAL_W, strips
+from gs2d.kernels.cuda.cuda_losses import MEAN_PIXELS, NORMAL_H, NORMAL_W, strips
 from gs2d.kernels.cuda.launch import Launcher, Work
 from gs2d.kernels.cuda.sort import (
     DIGITS,
@@ -179,6 +179,7 @@ def _key(step: WholeStep) -> tuple[object, ...]:
         step.photograph.shape[2],
         step.losses.silhouette is not None,
         None if step.losses.normals is None else step.losses.normals[1:],  # without the weight
+        step.losses.smooth_normals > 0,
         0 if step.rows is None else step.rows.data_ptr(),
         tuple([(name, tensor.data_ptr()) for name, tensor in step.gathered.items()]),
         tuple([tensor.data_ptr() for _, tensor in splats.items()]),
@@ -355,6 +356,12 @@ class _Losses:
             tiles = -(-width // NORMAL_W) * -(-height // NORMAL_H)
             self.works.append(Work("normal_consistency_vjp", tiles, THREADS, normals))
             self._normals = normals
+        self._smooth: structures.SmoothArguments | None = None
+        if step.losses.smooth_normals and "normal" in upstream:
+            smooth = structures.SmoothArguments(height=height, width=width, adds=1)  # to those of normal consistency
+            structures.fill(smooth, normal=images["normal"], alpha=images["alpha"], g_normal=upstream["normal"])
+            self.works.append(Work("normal_smoothness", -(-height * width // MEAN_PIXELS), THREADS, smooth))
+            self._smooth = smooth
         self._silhouette: structures.SilhouetteArguments | None = None
         if "alpha" in upstream:
             silhouette = structures.SilhouetteArguments(pixels=height * width)
@@ -381,6 +388,10 @@ class _Losses:
             normals.fx, normals.fy, normals.cx, normals.cy = view.fx, view.fy, view.cx, view.cy
             normals.rotation = view.R
             normals.scale = np.float32(wanted.weight) * np.float32(1 / max(step.valid, 1))
+        if self._smooth is not None:
+            assert step.flatness is not None
+            self._smooth.mask, self._smooth.flatness = mask, step.flatness.data_ptr()
+            self._smooth.scale = np.float32(step.losses.smooth_normals) * np.float32(1 / max(step.valid, 1))
         if self._silhouette is not None:
             self._silhouette.mask, self._silhouette.object = mask, photograph
             self._silhouette.scale = np.float32(step.losses.silhouette or 0.0) / np.float32(max(step.valid, 1))

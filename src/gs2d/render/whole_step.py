@@ -69,6 +69,8 @@ class StepLosses(NamedTuple):
     silhouette : float or None
         Weight, for images with alpha; None: no silhouette loss.
     normals : StepNormals or None
+    smooth_normals : float
+        Weight of normal smoothness; a step has it only beside ``normals``.
     """
 
     l1: float = 0.0
@@ -76,6 +78,7 @@ class StepLosses(NamedTuple):
     l2: float = 0.0
     silhouette: float | None = None
     normals: StepNormals | None = None
+    smooth_normals: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,7 +89,8 @@ class WholeSteps:
             if added is None or not fields.keys().isdisjoint(added):
                 return None
             fields |= added
-        return StepLosses(**fields)
+        losses = StepLosses(**fields)
+        return None if losses.smooth_normals and losses.normals is None else losses
 
     def _learned(self, state: TrainState, iteration: int) -> dict[str, Learned]:
         rates, stage, found = lr_at(self._stage.lr, iteration, self._whole.scene.extent), self._stage, {}

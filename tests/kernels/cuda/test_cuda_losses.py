@@ -120,6 +120,24 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
 
 
 @pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", [*SIZES, (35, 31)])
+def test_normal_smoothness_and_its_gradient_are_those_of_the_reference(
+    emulator: emulate.Emulator, size: tuple[int, int], masked: bool
+) -> None:
+    normal, _, alpha, mask = geometry(*size)
+    flatness = torch.randint(0, 256, size, generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    given = (alpha, flatness, mask if masked else None)
+    normal.requires_grad_()
+    exact_normal = normal.detach().double().requires_grad_()
+    value = ops.normal_smoothness(normal, *given, launcher=emulator)
+    exact = reference.normal_smoothness(exact_normal, *given)
+    assert value.item() == pytest.approx(exact.item(), abs=1e-6)
+    (found,) = torch.autograd.grad(value, normal, torch.tensor(0.8))
+    (expected,) = torch.autograd.grad(exact, exact_normal, torch.tensor(0.8).double())
+    assert relative_error(found, expected) < 2e-5
+
+
+@pytest.mark.parametrize("masked", [False, True])
 def test_the_mean_of_a_map_and_its_gradient_are_those_of_the_reference(
     emulator: emulate.Emulator, masked: bool
 ) -> None:

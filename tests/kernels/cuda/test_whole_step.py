@@ -127,6 +127,15 @@ def with_squares(recipe: Recipe) -> Recipe:
     return with_term(recipe, LossTerm("l2", 10.0, start=3))
 
 
+def with_smooth_normals(recipe: Recipe) -> Recipe:
+    """Return the recipe with normal smoothness beside normal consistency, as in ``best``."""
+    flat, stages = with_options(recipe, where="object", flat=3.0), []
+    for stage in flat.stages:
+        added = [LossTerm("normal_smoothness", 0.8, t.start) for t in stage.losses if t.kind == "normal_consistency"]
+        stages.append(replace(stage, losses=(*stage.losses, *added)))
+    return replace(flat, stages=tuple(stages))
+
+
 def with_term(recipe: Recipe, term: LossTerm) -> Recipe:
     """Return the recipe with an additional term in all stages."""
     return replace(recipe, stages=tuple(replace(stage, losses=(*stage.losses, term)) for stage in recipe.stages))
@@ -147,6 +156,7 @@ VARIANTS = {
     "object": (masked, of_object(train_toys.short()), replace(GENERIC, depth="median")),
     "flat": (masked, with_options(train_toys.short(), where="object", flat=6.0), GENERIC),
     "flat, opaque": (lambda scene: scene, with_options(train_toys.short(), where="object", flat=6.0), GENERIC),
+    "smooth": (masked, with_smooth_normals(train_toys.short()), GENERIC),
     "silhouettes": (masked, with_silhouettes(of_object(train_toys.short())), GENERIC),
     "squares": (masked, with_squares(train_toys.short()), GENERIC),
     "masks": (masked, at_camera(train_toys.short()), replace(GENERIC, background=(0.2, 1.0, 0.7))),

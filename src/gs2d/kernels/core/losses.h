@@ -96,4 +96,20 @@ GS2D_HD DepthNormalGrad<V> depth_normal_vjp(const DepthNormal<V>& f, Vec3<V> g, 
     return {f.slope_x * fma(fx, d.x, -(offset_x * d.z)), f.slope_y * fma(fy, d.y, -(offset_y * d.z))};
 }
 
+constexpr int SMOOTH_REACH = 2;         // losses.formulas.SMOOTH_REACH
+constexpr double SMOOTH_BEND = 0.01;    // losses.formulas.SMOOTH_BEND
+
+// w (sqrt(|n - m|^2 + d^2) - d) of a pixel and a neighbour with normals n and m, and its gradient by n. d: SMOOTH_BEND.
+template <class V> struct BendPoint {
+    V value;
+    Vec3<V> gradient;
+};
+
+template <class V> GS2D_HD BendPoint<V> bend_point(Vec3<V> n, Vec3<V> m, V weight) {
+    const V bend = V(SMOOTH_BEND);
+    const Vec3<V> d = n - m;
+    const V length = sqrt(fma(bend, bend, dot(d, d)));
+    return {weight * (length - bend), (weight / length) * d};
+}
+
 }  // namespace gs2d

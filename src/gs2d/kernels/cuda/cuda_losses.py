@@ -25,14 +25,15 @@ from gs2d.kernels.cuda.kernel_arguments import (
     NormalArguments,
     PhotometricArguments,
     PhotometricVjpArguments,
+    SmoothArguments,
     fill,
 )
-from gs2d.kernels.native_losses import NormalOptions, needs_gradient
+from gs2d.kernels.native_losses import NormalOptions, check_smoothness, needs_gradient
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
 
-__all__ = ["blur", "masked_mean", "normal_consistency", "photometric", "strips"]
+__all__ = ["blur", "masked_mean", "normal_consistency", "normal_smoothness", "photometric", "strips"]
 
 THREADS = 128
 STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows per block
@@ -268,6 +269,54 @@ def normal_consistency(
     how = replace(how, mask=_mask_of(how.mask, normal.device), weights=weights)
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
     value: Tensor = _CudaNormalConsistency.apply(*images, how, launcher)
+    return value
+
+
+class _CudaNormalSmoothness(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, launcher: Launcher, *images: Tensor | None) -> Tensor:
+        normal = images[0]
+        assert normal is not None
+        partials = normal.new_empty(2, -(-normal.shape[0] * normal.shape[1] // MEAN_PIXELS))
+        _smoothness(launcher, images, partials=partials)
+        means = _finish(launcher, partials)
+        ctx.launcher = launcher
+        ctx.save_for_backward(*images, means)
+        return means[1].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        *images, means = ctx.saved_tensors
+        gradient = torch.empty_like(images[0])
+        _smoothness(ctx.launcher, images, means=means, cotangent=_cotangent(cotangent), g_normal=gradient)
+        return None, gradient, None, None, None
+
+
+def _smoothness(launcher: Launcher, images: Sequence[Tensor | None], **more: Tensor | None) -> None:
+    normal, alpha, flatness, mask = images
+    assert normal is not None
+    arguments = SmoothArguments(*normal.shape[:2])
+    fill(arguments, normal=normal, alpha=alpha, flatness=flatness, mask=mask, **more)
+    if normal.numel() > 0:
+        launcher.launch("normal_smoothness", -(-normal.shape[0] * normal.shape[1] // MEAN_PIXELS), THREADS, arguments)
+
+
+def normal_smoothness(
+    normal: Tensor,
+    alpha: Tensor,
+    flatness: Tensor,
+    mask: Tensor | None = None,
+    *,
+    expected: float = 1.0,
+    launcher: Launcher,
+) -> Tensor:
+    """Return the CUDA form of ``losses.formulas.normal_smoothness``; ``expected`` is unused."""
+    del expected
+    check_smoothness(normal, alpha, flatness, mask)
+    _, alpha = ready(normal=normal, alpha=alpha)
+    given = normal.contiguous(), alpha, flatness.contiguous(), _mask_of(mask, normal.device)
+    value: Tensor = _CudaNormalSmoothness.apply(launcher, *given)
     return value
 
 

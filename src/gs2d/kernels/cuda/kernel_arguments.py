@@ -290,6 +290,17 @@ class NormalArguments(ctypes.Structure):
     )
 
 
+class SmoothArguments(ctypes.Structure):
+    """Arguments of losses.cu."""
+
+    _fields_ = (
+        *_all(ctypes.c_int64, "height", "width"),
+        *_pointers("normal", "alpha", "flatness", "mask", "partials", "means", "cotangent", "g_normal"),
+        ("scale", ctypes.c_float),
+        ("adds", ctypes.c_int32),
+    )
+
+
 class SilhouetteArguments(ctypes.Structure):
     """Arguments of losses.cu."""
 

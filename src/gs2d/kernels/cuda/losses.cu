@@ -29,6 +29,17 @@ struct NormalArguments {
     float flat_more;
 };
 
+struct SmoothArguments {
+    int64 height, width;
+    const float *normal, *alpha;  // [H, W, 3], [H, W]
+    const uchar *flatness, *mask;  // the mask may be null
+    float* partials;               // [2, blocks]: valid pixels, sum; or null
+    const float *means, *cotangent;  // of the gradient: means[0] = 1 / valid pixels; null if `scale` is set
+    float* g_normal;                 // or null
+    float scale;                     // cotangent / valid pixels
+    int adds;                        // whether to add to g_normal
+};
+
 struct SilhouetteArguments {
     int64 pixels;
     const float* alpha;   // [H, W], rendered
@@ -146,6 +157,45 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
         const float gradient = (from_left - from_right) + (from_above - from_below);
         a.g_depth[(top + dy) * a.width + left + dx] = keep(was_hit(depth[dy + 2][dx + 2]), gradient);
     }
+}
+
+// A normal and its weight; both are 0 outside the image and at ignored pixels.
+struct Smoothed {
+    Vec3<float> normal;
+    float weight;
+};
+
+__device__ __forceinline__ Smoothed smoothed_at(const SmoothArguments& a, int64 x, int64 y) {
+    if (x < 0 || y < 0 || x >= a.width || y >= a.height) return {{0.f, 0.f, 0.f}, 0.f};
+    const int64 at = y * a.width + x;
+    if (a.mask && !a.mask[at]) return {{0.f, 0.f, 0.f}, 0.f};
+    return {{a.normal[3 * at], a.normal[3 * at + 1], a.normal[3 * at + 2]},
+            a.alpha[at] > 0.5f ? part_of_255(a.flatness[at]) : 0.f};
+}
+
+// Computes the smoothness of normals, its gradient, or both.
+extern "C" __global__ void __launch_bounds__(128) normal_smoothness(SmoothArguments a) {
+    float sums[2] = {0.f, 0.f};
+    const float scale = a.means ? *a.cotangent * a.means[0] : a.scale;
+    for (int i = 0; i < MEAN_PIXELS; i += MEAN_THREADS) {
+        const int64 at = int64(blockIdx.x) * MEAN_PIXELS + i + threadIdx.x;
+        if (at >= a.height * a.width) continue;
+        const int64 x = at % a.width, y = at / a.width;
+        const Smoothed here = smoothed_at(a, x, y);
+        const auto pair = [&](int64 x2, int64 y2) {
+            const Smoothed there = smoothed_at(a, x2, y2);
+            return bend_point(here.normal, there.normal, min(here.weight, there.weight));
+        };
+        const BendPoint<float> right = pair(x + SMOOTH_REACH, y), below = pair(x, y + SMOOTH_REACH);
+        sums[0] = sums[0] + (a.mask && !a.mask[at] ? 0.f : 1.f), sums[1] = sums[1] + (right.value + below.value);
+        if (!a.g_normal) continue;
+        const BendPoint<float> left = pair(x - SMOOTH_REACH, y), above = pair(x, y - SMOOTH_REACH);
+        const Vec3<float> g = scale * ((right.gradient + left.gradient) + (below.gradient + above.gradient));
+        float* to = a.g_normal + 3 * at;
+        to[0] = (a.adds ? to[0] : 0.f) + g.x, to[1] = (a.adds ? to[1] : 0.f) + g.y;
+        to[2] = (a.adds ? to[2] : 0.f) + g.z;
+    }
+    if (a.partials) leave_sums(sums, a.partials);
 }
 
 // Computes the gradient of the mean |alpha - target alpha| over valid pixels; 0 where both are equal.
