@@ -44,7 +44,7 @@ SILHOUETTE = 0.1  # weight of the silhouette loss: docs/notebook/losses.md
 # Weight of normal consistency in best, and in best without L2: docs/notebook/losses.md
 BEST_NC, NC_WITHOUT_SQUARES = 0.035, 0.02
 FLAT_FACTOR = 3.0  # of that weight where photographs have no texture: docs/notebook/best.md
-SMOOTHNESS = 0.8  # weight of normal smoothness, which has no effect on texture: docs/notebook/best.md
+SMOOTHNESS = 0.4  # weight of normal smoothness, which has no effect on texture: docs/notebook/best.md
 SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and the fraction of iterations before it: the same page
 SH_FASTER = 2.5  # factor of the official rate of SH beyond degree 0: docs/notebook/training.md
 SETTLING, SETTLED = 0.3, 0.1  # last fraction of iterations in which rates fall, and final factor: training.md
