@@ -210,8 +210,9 @@ def best(
     Not in the paper. A good start needs no opacity resets and fewer iterations, with larger rates. Large splats stay,
     because they represent the surroundings. A silhouette loss uses the alpha of the images, L2 is active after
     densification, and the mesh uses the transmittance depth (docs/notebook/best.md). ``nc`` is the weight of normal
-    consistency, which is heavier where photographs have no texture; there normals are smooth, too. ``squares`` is that of L2 (0 leaves it out).
-    View-dependent colours learn faster than in 2DGS, except with few images (:func:`with_few_views`).
+    consistency, which is heavier where photographs have no texture; there normals are smooth, too. ``squares`` is the
+    weight of L2 (0 leaves it out). View-dependent colours learn faster than in 2DGS, except with few images
+    (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
     smooth = {"where": "object", "flat": FLAT_FACTOR}
