@@ -109,7 +109,7 @@ template <class V> GS2D_HD BendPoint<V> bend_point(Vec3<V> n, Vec3<V> m, V weigh
     const V bend = V(SMOOTH_BEND);
     const Vec3<V> d = n - m;
     const V length = sqrt(fma(bend, bend, dot(d, d)));
-    return {weight * (length - bend), (weight / length) * d};
+    return {weight * (length - bend), quotient(weight, length) * d};
 }
 
 }  // namespace gs2d
