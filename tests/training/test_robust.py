@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -29,7 +30,7 @@ from gs2d.training.learned.point_gains import point_gains
 from gs2d.training.robust.backdrop import EVEN, find_backdrop
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
 from gs2d.training.robust.robustness import Robustness
-from gs2d.training.robust.seen_area import LARGEST, largest_log_scales, votes_against_unseen
+from gs2d.training.robust.seen_area import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.start.initialize import initial_splats
 from gs2d.training.start.plane_sweep import start_points, sweep_views
@@ -233,7 +234,7 @@ def test_the_largest_scale_is_a_fraction_of_the_image_at_the_nearest_camera(monk
     assert torch.equal(largest_log_scales(splats, cameras), whole)
 
 
-def test_large_splats_shrink_only_on_known_surfaces() -> None:
+def test_large_splats_shrink_on_known_surfaces_and_elsewhere_to_the_size_of_an_image() -> None:
     state, stage = full_state(20), short().stages[0]
     splats = state.splats
     splats.means[:10], splats.means[10:] = torch.tensor([0.5, 0.0, WALL]), torch.tensor([0.5, 0.0, 3 * WALL])
@@ -249,6 +250,10 @@ def test_large_splats_shrink_only_on_known_surfaces() -> None:
     torch.testing.assert_close(short_axis, torch.full((10,), 0.1))
     assert (long_axis < 0.3 * WALL).all()
     assert torch.equal(state.splats.log_scales[10:], kept[10:])
+    state.splats.log_scales[10:, 1] = math.log(100 * WALL)
+    robust.remove(state, replace(stage, iterations=20), 10)
+    most = largest_log_scales(state.splats, cameras_of_the_wall()) + math.log(LARGEST_ANYWHERE / LARGEST)
+    torch.testing.assert_close(state.splats.log_scales[10:, 1:], most[10:])
 
 
 def test_a_resumed_robust_training_ends_with_the_same_bits() -> None:

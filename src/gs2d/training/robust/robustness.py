@@ -27,7 +27,7 @@ from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.robust.backdrop import in_color
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
 from gs2d.training.robust.opaque import is_opaque
-from gs2d.training.robust.seen_area import largest_log_scales, votes_against_unseen
+from gs2d.training.robust.seen_area import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.rows import keep_rows
 from gs2d.training.start.background_sphere import sphere_points
@@ -162,16 +162,18 @@ class Robustness:
 
     @torch.no_grad()
     def _limit_scales(self, state: TrainState) -> None:
-        """Shrink large splats on surfaces of known depth, where they hide detail.
+        """Shrink large splats on surfaces of known depth, where they hide detail, and all larger than an image.
 
-        Elsewhere large splats stay, because they are all that new views show in regions with few images.
+        Elsewhere large splats stay, because they are all that new views show in regions with few images. Beyond the
+        size of an image, the tail of a splat is a veil before the surface.
         """
         cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
         most = largest_log_scales(state.splats, cameras)
         large = (state.splats.log_scales > most).any(dim=1)
         shrinks = self._processes.decide(self._are_shown, state.splats, large).bool()
         scales = state.splats.log_scales
-        self._backend.assign(scales, torch.where(shrinks[:, None], torch.minimum(scales, most), scales))
+        limits = torch.where(shrinks[:, None], most, most + math.log(LARGEST_ANYWHERE / LARGEST))
+        self._backend.assign(scales, torch.minimum(scales, limits))
 
     def _are_shown(self, splats: Splats, large: Tensor) -> Tensor:
         """Return which of the large splats lie on a surface that many images show, uint8 [N]."""

@@ -26,6 +26,7 @@ INSIDE = 0.6  # it stays, too, if this fraction of it lies within the union of t
 LARGE = 0.001  # fraction of an image: smaller splats cannot hide much
 COVERS = 0.5  # fraction of an image: a splat this large would be a veil before a view beside that camera
 LARGEST = 0.12  # largest standard deviation of a splat on a known surface, as a fraction of an image
+LARGEST_ANYWHERE = 1.0  # the same for every other splat
 PAIRS = 1 << 24  # distances between splats and cameras that are in memory at a time, 64 MB
 SIDE = 200  # px, longer side of the images that are rendered
 
