@@ -111,6 +111,7 @@ LINES = (
     "mesh RUN --voxel 0.01 --set depth=median --texture --set texture_size=512",
     "render RUN --split test --out FOLDER --set fps=24 --orbit 30",
     "export RUN --out a.spz --format spz --bbox -1 -1 -1 1 1 1",
+    "edit RUN --merge OTHER --transform 2 90 0 0 0 0 1.5 --out b.ply",
     "evaluate RUN --mesh-gt a.ply --json",
     "poses PHOTOS --out CAPTURE",
     "sweep A B --recipes 2dgs,2dgs-r --out TABLE",

@@ -48,7 +48,7 @@ class Command:
 
 _CORE = (
     *("doctor", "reconstruct", "view", "poses", "train", "mesh"),
-    *("info", "render", "export", "evaluate", "recipes"),
+    *("info", "render", "export", "edit", "evaluate", "recipes"),
 )
 COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE, "gs2d.cli.commands"))
 

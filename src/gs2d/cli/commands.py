@@ -11,6 +11,7 @@ from gs2d.cli.command_registry import BEGIN, LOOK, MEASURE, STEPS, register_comm
 from gs2d.config.arguments import SETTING, Arg
 from gs2d.pipeline.prepare.options import (
     BoxOption,
+    EditOptions,
     EvaluateOptions,
     MeshOptions,
     Overrides,
@@ -174,6 +175,17 @@ class ExportCommand(Common):
     """Export only splats whose centre is in this box. `gs2d view` shows its numbers."""
     sh_degree: Annotated[int, SETTING] = 3
     """With html: degree of the view-dependent colours, 0 to 3. Lower is smaller: 32 to 80 bytes per splat."""
+
+
+@register_command("edit", action="gs2d.cli.handlers:edit", group=LOOK)
+@dataclass(frozen=True, kw_only=True)
+class EditCommand(EditOptions, Common):
+    """Delete, merge or move splats of a run, undoably, or of a file."""
+
+    run: RunPath
+    """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
+    out: Annotated[Path | None, Arg(metavar="FILE")] = None
+    """Write the edited splats to this file, in the format of its ending, and leave the run as it is."""
 
 
 @register_command("recipes", action="gs2d.cli.handlers:recipes", group=MEASURE)

@@ -13,7 +13,7 @@ from gs2d.cli.console import Console
 from gs2d.cli.results import score_rows, show_run, show_surface
 from gs2d.core.processes import process_rank
 from gs2d.errors import ProtocolError, RecipeError, RunError
-from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
+from gs2d.pipeline.prepare.options import EditOptions, MeshOptions, TextureOptions, values
 
 EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows without --all
 
@@ -191,6 +191,17 @@ def _export_page(command: c.ExportCommand, console: Console) -> None:
     result = page_run(command.run, command.out, sh_degree=command.sh_degree, on_event=console.on_event)
     console.close()
     console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
+    console.result(result)
+
+
+def edit(command: c.EditCommand, console: Console) -> None:
+    """``gs2d edit``."""
+    from gs2d.pipeline.finish.edit import edit as edit_splats
+
+    result = edit_splats(command.run, EditOptions(**values(EditOptions, command)), command.out)
+    console.say(f"{result['file']}: {result['splats']:,} splats, before {result['before']:,}")
+    for note in result["notes"]:
+        console.say(note)
     console.result(result)
 
 

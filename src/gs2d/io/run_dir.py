@@ -9,6 +9,7 @@
       metrics.json  splats.ply  mesh.ply  mesh.glb (with --texture)  renders/  report.html
       scene.html     the splats as a web page (`gs2d export`)
       poses.json  learned.json  learned properties of images and cameras
+      edits/         0001.ply ...: the splats before each edit (`gs2d edit`)
       subject.json   the subject that the cameras look at (data.subject_box)
       georeference.json  position of the run in the world, if known
       .lock          held by the process that trains; the operating system releases it when that process ends
@@ -48,7 +49,7 @@ from gs2d.io.event_log import EventLog
 from gs2d.io.run_schema import DEFINITION_SHAPE, METRICS_SHAPE, check_shape
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
-CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
+CHECKPOINTS, RENDERS, SURFACE, EDITS = "checkpoints", "renders", "surface", "edits"
 LOSSES = "losses"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
 POSES, LEARNED, SUBJECT, VERDICT = "poses.json", "learned.json", "subject.json", "verdict.json"
@@ -188,7 +189,7 @@ class RunFolder:
     def sweep(self) -> None:
         """Remove what killed processes left: temporary files, and checkpoints within stages that have ended."""
         renders = (Path(folder) for folder, _, _ in os.walk(self.file(RENDERS)))
-        for folder in (self.path, self.file(CHECKPOINTS), self.file(SURFACE), *renders):
+        for folder in (self.path, *map(self.file, (CHECKPOINTS, SURFACE, EDITS)), *renders):
             sweep(folder)
         ended = max((c.stage_index for c in self.checkpoints() if c.iteration is None), default=-1)
         for checkpoint in self.checkpoints():
@@ -198,7 +199,7 @@ class RunFolder:
 
     def clear(self) -> None:
         """Delete the files of the run only; ``run.json`` last, so that an interrupted call can be repeated."""
-        for name in (CHECKPOINTS, RENDERS, SURFACE):
+        for name in (CHECKPOINTS, RENDERS, SURFACE, EDITS):
             shutil.rmtree(self.file(name), ignore_errors=True)
         results = (SPLATS, SUBJECT, VERDICT, GEOREFERENCE, MESH, TEXTURED, REPORT, PAGE)
         for name in (EVENTS, METRICS, POSES, LEARNED, *results, RUN_JSON):

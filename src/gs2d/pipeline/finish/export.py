@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from gs2d.core.splats import Splats
 from gs2d.errors import RunError
 from gs2d.io.formats.splat_formats import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
+from gs2d.io.gaussians import Tell
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.finish.run_subject import within
 from gs2d.pipeline.prepare.loaded import checked_output, finished_splats
@@ -23,7 +25,25 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
     bbox : six floats, optional
         Only splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
     """
-    layout = layout or layout_of(Path(out))
+    path, out = Path(path), Path(out)
+    layout = checked_layout(path, out, layout)
+    notes: list[str] = []
+    splats = splats_of(path, notes.append)
+    splats = splats if bbox is None else within(splats, bbox)
+    notes += write_layout(out, splats, layout)
+    size = written_bytes(out, layout)
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes}
+
+
+def checked_layout(path: Path, out: Path, layout: str | None = None) -> str:
+    """Return the layout of the splat file ``out`` that is written from the run or file ``path``.
+
+    Raises
+    ------
+    RunError
+        If there is no such layout, ``out`` has another ending, or is a file that must not be replaced.
+    """
+    layout = layout or layout_of(out)
     if layout is None:
         raise RunError(
             f"--out must end in {', '.join(endings()).replace('/', '')}, got {out} (meshes are written by `gs2d mesh "
@@ -31,17 +51,16 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
         )
     if layout not in LAYOUTS:
         raise RunError(LAYOUTS.unknown(layout))
-    path, out = Path(path), checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout}")
+    checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout}")
     if out.resolve() in ((path / MESH).resolve(), path.resolve()):
         raise RunError(f"--out {out} is the mesh of the run or the input file; choose another name")
-    notes: list[str] = []
+    return layout
+
+
+def splats_of(path: Path, tell: Tell) -> Splats:
+    """Return the splats of a finished run or of a file of flat splats; ``tell`` receives what a reader dropped."""
     if path.is_file():
-        splats = read_splats(path, notes.append)
-    else:
-        run = open_run(path)
-        run.sweep()
-        splats = finished_splats(run)
-    splats = splats if bbox is None else within(splats, bbox)
-    notes += write_layout(out, splats, layout)
-    size = written_bytes(out, layout)
-    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes}
+        return read_splats(path, tell)
+    run = open_run(path)
+    run.sweep()
+    return finished_splats(run)

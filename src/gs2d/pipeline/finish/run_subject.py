@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 from gs2d.core.camera import Camera
 from gs2d.core.json_files import write_json
@@ -105,7 +106,20 @@ def wants_subject(loaded: RenderedScene, options: MeshOptions) -> bool:
 
 
 def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Splats:
-    """Return the splats with their centres in a box, x0 y0 z0 x1 y1 z1, world units; ``option`` is its name in errors.
+    """Return the splats with their centres in a box; errors are as in :func:`centers_inside`."""
+    return splats.rows(centers_inside(splats, box, option))
+
+
+def centers_inside(splats: Splats, box: Sequence[float], option: str) -> Tensor:
+    """Return which splats have their centres in a box, bool [N].
+
+    Parameters
+    ----------
+    splats : Splats
+    box : sequence of 6 floats
+        x0 y0 z0 x1 y1 z1, world units; the faces belong to it.
+    option : str
+        Name of the box in errors.
 
     Raises
     ------
@@ -119,7 +133,7 @@ def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Spla
     if not bool(inside.any()):
         ends = torch.cat([splats.means.min(dim=0).values, splats.means.max(dim=0).values])
         raise RunError(f"{option} contains none of the {len(splats):,} splats; all are in {_numbers(ends.tolist())}")
-    return splats.rows(inside)
+    return inside
 
 
 def _numbers(box: Iterable[float]) -> str:

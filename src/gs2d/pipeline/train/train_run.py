@@ -11,6 +11,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import RunError
 from gs2d.io.run_dir import (
+    EDITS,
     MESH,
     PAGE,
     REPORT,
@@ -117,6 +118,11 @@ def _train(
             run.made += make_folder(options.cache)
         if is_run(run.path):
             check_same_run(run, loaded.resolved)
+            if run.file(EDITS).exists():
+                raise RunError(
+                    f"the splats of {run.path} were edited, and --resume would replace them; undo the edits with "
+                    f"`{again('edit', run.path, '--undo')}`, or train into another --out"
+                )
             if run.file(SPLATS).exists() and not run.checkpoints():
                 raise RunError(
                     f"{run.path} is finished and has no checkpoints to resume; train it again with --overwrite, or "
