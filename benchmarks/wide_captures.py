@@ -187,8 +187,18 @@ def write_photographs(
     patterns, poses = walls(), walk(count, tilt=tilt, turn=180.0 if kind == "panorama" else 25.0)
     names = [f"{i:03}.jpg" for i in range(count)]
     for name, pose in zip(names, poses, strict=True):
-        Image.fromarray(photograph(patterns, pose, rays, size, boxes)).save(folder / name, quality=95)
+        image = Image.fromarray(photograph(patterns, pose, rays, size, boxes))
+        image.save(folder / name, quality=95, **({"xmp": whole_sphere(*size)} if kind == "panorama" else {}))
     return dict(zip(names, poses, strict=True))
+
+
+def whole_sphere(width: int, height: int) -> bytes:
+    """Return the XMP tag of a full panorama, as 360-degree cameras write it."""
+    sides = (("Width", width), ("Height", height))
+    numbers = " ".join(
+        f'GPano:{of}{side}Pixels="{size}"' for side, size in sides for of in ("CroppedAreaImage", "FullPano")
+    )
+    return f'<rdf:Description GPano:ProjectionType="equirectangular" {numbers}/>'.encode()
 
 
 def errors(capture: Path, truth: dict[str, np.ndarray]) -> dict[str, float]:

@@ -36,7 +36,7 @@ _PHASES = {
     "matching": "matching pairs",
     "verifying": "matching as fisheyes",
     "cameras": "placing cameras",
-    "lenses": "comparing lenses",
+    "lenses": "adjusting the lens",
     "extending": "placing more cameras",
 }
 
@@ -54,19 +54,12 @@ class Group:
         Width and height, px.
     original : str
         An image file with EXIF.
-    hint : "circle", "name", "asked" or ""
-        Why the camera may be a fisheye (``as_fisheye``).
-    circle : (float, float, float) or None
-        Image circle (``fisheye.Circle``): centre as fractions of width and height, radius as fraction of the longer
-        side.
     """
 
     names: tuple[str, ...]
     camera_model: str
     size: tuple[int, int]
     original: str
-    hint: str = ""
-    circle: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -93,7 +86,7 @@ class Request:
     feature_size : int
         Longer side for feature detection, px.
     asked_lens : str or None
-        Requested camera model; None: models are compared.
+        Requested camera model; None: by the number of images (``lens``).
     masks : str or None
         Folder of masks (``NAME.png``): black pixels give no features.
     """
@@ -143,7 +136,7 @@ class Solved:
     models : list of dict
         Facts of each model that was written, largest first; empty if nothing could be placed.
     lens : dict
-        The chosen lens (``lens.lens_line``); empty without a model.
+        The lens, ``chosen`` and ``asked``; empty without a model.
     """
 
     models: list[dict[str, Any]]

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.similarity import rotation_to_z
-from gs2d.sfm import as_fisheye
+from gs2d.sfm.as_fisheye import settle_fisheyes
 from gs2d.sfm.compare import find_features, match
-from gs2d.sfm.lens import BENT, MODELS, START, apply, choose, has_two_focal_lengths, try_lenses
+from gs2d.sfm.lens import RICH, START, with_rich_lenses
 from gs2d.sfm.mapping import extend, map_globally, map_incrementally
 from gs2d.sfm.panoramas import PANORAMA
-from gs2d.sfm.search import HINTED, MAPPING
+from gs2d.sfm.search import FISHEYES, MAPPING
 from gs2d.sfm.steps import Steps
 from gs2d.sfm.upright import up_direction
 
@@ -41,8 +41,6 @@ ATTEMPTS: dict[str, dict[str, float]] = {
 AT_ONCE = "all at once"  # the global mapper
 ENOUGH = 0.5  # of the images in one model: no further attempt
 CLEARLY = 1.5  # factor by which a looser attempt must place more images to replace a stricter one
-AS_FISHEYES = "as fisheyes, "  # prefix of attempts with cameras that were first placed with another lens
-FISHEYES = "fisheyes"  # step: results for the cameras that were tested for a fisheye
 
 
 def main(request_path: str) -> None:
@@ -73,18 +71,18 @@ def map_(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> dict
     dict
         ``models``: facts of each model, largest first; ``lens``: the lens that was chosen.
     """
-    if steps.facts(HINTED) is None:
-        as_fisheye.settle_hinted(pycolmap, request, steps, say)
+    if steps.facts(FISHEYES) is None:
+        settle_fisheyes(pycolmap, request, steps, say)
     if steps.facts("first") is None:
-        _first_models(pycolmap, request, steps, say)
+        steps.finish("first", _first_models(pycolmap, request, steps, say))
     names = steps.facts("first") or []
     lens: dict[str, Any] = {}
     if names:
         if steps.facts("lens") is None:
             _settle_lens(pycolmap, request, names[0], steps, say)
-        lens = steps.facts("lens") or {}
+        lens = steps.facts("lens")
         if steps.facts("extended") is None:
-            _extend(pycolmap, request, lens, steps, say)
+            _extend(pycolmap, request, steps, say)
         names = ["extended", *names[1:]]
     shutil.rmtree(request["output"], ignore_errors=True)
     models = [
@@ -106,62 +104,26 @@ def _threads(request: dict[str, Any]) -> int:
     return 1 if len(request["in_order"]) <= REPEATABLE else int(request["threads"])
 
 
-def _first_models(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
-    """Step "first": place the images; the result is the names of the models, largest first.
-
-    If the models suggest that a camera may be a fisheye, and its matches confirm it, the images are placed again.
-    """
-    names, _ = _try_attempts(pycolmap, request, steps, say, "")
-    tested = steps.facts(HINTED) or []
-    if (found := steps.facts(as_fisheye.SUSPECTED)) is None:
-        found = as_fisheye.suspects(pycolmap, request, steps.read(pycolmap, names[0]) if names else None)
-        steps.finish(as_fisheye.SUSPECTED, found)
-    if found:
-        names, found = _as_fisheyes(pycolmap, request, steps, say, names, found)
-    steps.finish(FISHEYES, [*tested, *found])
-    steps.finish("first", names)
-
-
-def _try_attempts(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, prefix: str) -> tuple[list[str], int]:
-    """Return the models of the first attempt that places enough images, and the image count of the largest one."""
+def _first_models(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> list[str]:
+    """Return the names of the models of the first attempt that places enough images, largest first."""
     total = len(request["in_order"])
     say(phase="cameras", total=total)
     names, most = [], 0
     attempts = (AT_ONCE,) if request["mapper"] == "global" else tuple(ATTEMPTS)
     for attempt in attempts:
-        if (sizes := steps.facts(f"tried {prefix}{attempt}")) is None:
-            sizes = _attempt(pycolmap, request, steps, say, attempt, f"{prefix}{attempt}")
-            steps.finish(f"tried {prefix}{attempt}", sizes)
+        if (sizes := steps.facts(f"tried {attempt}")) is None:
+            sizes = _attempt(pycolmap, request, steps, say, attempt)
+            steps.finish(f"tried {attempt}", sizes)
         if (placed := max(sizes.values(), default=0)) > CLEARLY * most:
             if attempt != attempts[0]:
                 say(note=f"cameras were placed {attempt}: {placed} photographs, {most} with stricter thresholds")
             names, most = list(sizes), placed
         if most >= ENOUGH * total:
             break
-    return names, most
+    return names
 
 
-def _as_fisheyes(
-    pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, names: list[str], found: list[dict[str, Any]]
-) -> tuple[list[str], list[dict[str, Any]]]:
-    """Place the images again with these cameras as fisheyes; returns the better models and the updated findings."""
-    before = steps.facts("as they were")
-    if before is None:
-        cameras = as_fisheye.cameras_of(pycolmap, request, [row["camera"] for row in found])
-        before = [[camera.model.name, list(camera.params), camera.has_prior_focal_length] for camera in cameras]
-        steps.finish("as they were", before)
-    if steps.facts(as_fisheye.VERIFIED) is None:
-        as_fisheye.verify_anew(pycolmap, request, steps, as_fisheye.fisheyes(pycolmap, request, found), say)
-        steps.finish(as_fisheye.VERIFIED, True)
-    theirs, _ = _try_attempts(pycolmap, request, steps, say, AS_FISHEYES)
-    largest = steps.read(pycolmap, theirs[0]) if theirs else None
-    if largest is not None and as_fisheye.is_better(largest, steps.read(pycolmap, names[0]) if names else None):
-        return theirs, found
-    as_fisheye.put_back(pycolmap, request, steps, found, before, say)
-    return names, [{**row, "params": None} for row in found]
-
-
-def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, attempt: str, name: str) -> dict[str, int]:
+def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, attempt: str) -> dict[str, int]:
     """Map once; returns the image count of each usable model by name, largest first."""
     total, placed = len(request["in_order"]), 0
 
@@ -172,12 +134,12 @@ def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, att
 
     say(done=0)
     if attempt == AT_ONCE:
-        names = map_globally(pycolmap, request, steps, name, threads=_threads(request))
+        names = map_globally(pycolmap, request, steps, attempt, threads=_threads(request))
     else:
         options = _options(pycolmap, request)
         for threshold, value in ATTEMPTS[attempt].items():
             setattr(options.mapper, threshold, value)
-        names = map_incrementally(pycolmap, request["database"], options, steps, name, on_placed)
+        names = map_incrementally(pycolmap, request["database"], options, steps, attempt, on_placed)
     models = {each: steps.read(pycolmap, each) for each in names}
     sizes = {
         each: (model.num_reg_images(), model.num_points3D())
@@ -188,41 +150,23 @@ def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, att
 
 
 def _settle_lens(pycolmap: Any, request: dict[str, Any], name: str, steps: Steps, say: Say) -> None:
-    """Step "lens": compare lens models unless one was requested, and write the model ``name`` with the best one."""
-    model, asked = steps.read(pycolmap, name), request["asked_lens"]
-    trials = []
-    if all(camera.model.name == PANORAMA for camera in model.cameras.values()):
-        chosen = PANORAMA
-    elif asked:
-        chosen = asked
-    else:
-        say(phase="lenses", total=len(MODELS))
-        trials = try_lenses(
-            pycolmap, model, seed=request["seed"], threads=_threads(request), on_done=lambda i: say(done=i)
-        )
-        best = choose(trials)
-        chosen = best.model
-        if chosen not in (START, BENT[START]):
-            apply(pycolmap, model, best, threads=_threads(request))
+    """Step "lens": write the model ``name`` with its final lens: as requested, or by the number of images."""
+    model, chosen = steps.read(pycolmap, name), request["asked_lens"]
+    if not chosen:
+        say(phase="lenses", total=0)
+        model = with_rich_lenses(pycolmap, model, threads=_threads(request))
+        chosen = max((camera.model.name for camera in model.cameras.values()), key=[PANORAMA, START, RICH].index)
     steps.write("lens", model)
-    facts = {
-        "chosen": chosen,
-        "asked": asked,
-        "trials": [{"model": t.model, "error_px": t.error, "doubts": list(t.doubts)} for t in trials],
-        "fisheyes": steps.facts(FISHEYES) or [],
-    }
-    steps.finish("lens", facts)
+    steps.finish("lens", {"chosen": chosen, "asked": request["asked_lens"]})
 
 
-def _extend(pycolmap: Any, request: dict[str, Any], lens: dict[str, Any], steps: Steps, say: Say) -> None:
+def _extend(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
     """Step "extended": place images that did not fit before the lens was chosen."""
     model = steps.read(pycolmap, "lens")
     placed, total = model.num_reg_images(), len(request["in_order"])
     if placed < total:
         say(phase="extending", total=total - placed)
         options, count = _options(pycolmap, request), 0
-        if has_two_focal_lengths(lens["chosen"]) and not lens["asked"]:
-            options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
 
         def on_placed(number: int) -> None:
             nonlocal count

@@ -1,16 +1,13 @@
-"""Test from matches alone whether a camera is a fisheye, and estimate its focal length.
+"""Estimate the focal length of a fisheye from matches alone.
 
-For two pinhole images, all matches agree with one fundamental matrix. For two fisheye images, only matches in one part
-of the images do, but as rays of an equidistant fisheye with the right focal length all agree with one essential matrix.
-The inlier ratio over the focal length therefore has a peak for fisheyes, and none for other lenses. Runs in the worker,
-on the COLMAP database.
+As rays of an equidistant fisheye with the right focal length, all matches of two images agree with one essential
+matrix. The inlier ratio over the focal length therefore has a peak. Runs in the worker, on the COLMAP database.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,37 +15,14 @@ import numpy as np
 PAIRS, MATCHES = 16, 300  # number of pairs, and of matches of each
 FEWEST = 30  # verified matches of a pair
 OVERLAP = 0.7  # fraction of the pairs, those with most matches: the others have more false matches
-CLEARLY = 1.02  # smallest ratio of fisheye inliers to pinhole inliers; ordinary lenses have 1.00
-ANGLES = (45.0, 60.0, 75.0, 90.0, 105.0)  # degrees from the axis to the corner, or to the rim of the circle
+ANGLES = (45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 135.0, 150.0)  # degrees from the axis to the corner
 FINER = (-7.5, 7.5)  # degrees; tried around the best angle
 WITHIN = 0.0025  # of the longer side: inlier threshold
 _TRIALS = 1000  # of RANSAC
 
 
-@dataclass(frozen=True)
-class Probe:
-    """Inlier ratios of a camera's matches.
-
-    Attributes
-    ----------
-    plain, bent : float
-        Inlier ratio with a pinhole, and with the best fisheye.
-    focal : float, px
-        Focal length of the best fisheye, r = focal * angle.
-    """
-
-    plain: float
-    bent: float
-    focal: float
-
-    @property
-    def is_fisheye(self) -> bool:
-        """Whether a fisheye fits clearly better."""
-        return self.bent >= CLEARLY * self.plain
-
-
-def probe(pycolmap: Any, database: Any, camera: Any, *, reach: float, seed: int) -> Probe | None:
-    """Compare a pinhole with fisheyes of several focal lengths; None if too few pairs match.
+def fisheye_focal(pycolmap: Any, database: Any, camera: Any, *, seed: int) -> float | None:
+    """Return the focal length in px of the equidistant fisheye that fits the matches best; None if too few pairs match.
 
     Parameters
     ----------
@@ -56,28 +30,20 @@ def probe(pycolmap: Any, database: Any, camera: Any, *, reach: float, seed: int)
         With matches of pairs, verified with any lens.
     camera : pycolmap.Camera
         Its id, size and principal point are used.
-    reach : float, px
-        Distance from the principal point to the farthest corner, or to the rim of the circle.
     """
     matches = _matches(pycolmap, database, camera.camera_id, seed)
     if not matches:
         return None
-    centre = (camera.principal_point_x, camera.principal_point_y)
+    centre, size = (camera.principal_point_x, camera.principal_point_y), (camera.width, camera.height)
+    reach = math.hypot(*size) / 2
 
-    def share(model: str, focal: float) -> float:
-        return _share(pycolmap, model, (focal, *centre), (camera.width, camera.height), matches, seed)
+    def share(angle: float) -> float:
+        return _share(pycolmap, (reach / math.radians(angle), *centre), size, matches, seed)
 
-    plain = share("SIMPLE_PINHOLE", 1.2 * max(camera.width, camera.height))
-    bent, angle = _best(lambda a: share("SIMPLE_FISHEYE", reach / math.radians(a)))
-    return Probe(plain, bent, reach / math.radians(angle))
-
-
-def _best(share: Callable[[float], float]) -> tuple[float, float]:
-    """Return the largest inlier ratio, and its angle."""
     found = {angle: share(angle) for angle in ANGLES}
-    coarse = max(found, key=lambda angle: found[angle])
+    coarse = max(found, key=found.__getitem__)
     found |= {coarse + more: share(coarse + more) for more in FINER}
-    return max((much, angle) for angle, much in found.items())
+    return reach / math.radians(max(found, key=found.__getitem__))
 
 
 def _matches(pycolmap: Any, database: Any, camera: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -99,14 +65,13 @@ def _matches(pycolmap: Any, database: Any, camera: int, seed: int) -> list[tuple
 
 def _share(
     pycolmap: Any,
-    model: str,
     params: Sequence[float],
     size: tuple[int, int],
     matches: Sequence[tuple[np.ndarray, np.ndarray]],
     seed: int,
 ) -> float:
-    """Return the fraction of the matches that agree with one relative pose, for a camera of this model."""
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    """Return the fraction of the matches that agree with one relative pose, as rays of a fisheye."""
+    camera = pycolmap.Camera(model="SIMPLE_FISHEYE", width=size[0], height=size[1], params=list(params))
     camera.has_prior_focal_length = True
     options = pycolmap.TwoViewGeometryOptions()
     options.min_E_F_inlier_ratio, options.max_H_inlier_ratio = 0.0, 1.0  # always the essential matrix

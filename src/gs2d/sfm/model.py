@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from gs2d.data.readers.colmap import (
 from gs2d.data.undistort import colmap_intrinsics
 from gs2d.errors import DataError
 from gs2d.sfm.colmap_process import MatchFacts
-from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.panoramas import PANORAMA
 
 _MAX_ANGLES = 2000
@@ -155,16 +154,12 @@ def _first(names: Mapping[str, int]) -> str:
     return ", ".join(listed[:2]) + (" ..." if len(listed) > 2 else "")
 
 
-def camera_line(camera: ColmapCamera, images: int, circle: Circle | None = None) -> str:
-    """Describe an estimated camera: model, focal length, field of view (of the image circle, if there is one)."""
+def camera_line(camera: ColmapCamera, images: int) -> str:
+    """Describe an estimated camera: model, focal length, field of view."""
     if camera.model == PANORAMA:
         return f"{camera.model} of {images} photographs, {camera.width}x{camera.height} (360 degrees wide)"
     focal = focal_length(camera)
     k = colmap_intrinsics(camera.model, camera.model, camera.width, camera.height, camera.params)
-    if circle is not None and k.lens is not None and k.lens.kind == "fisheye":
-        across = round(2 * circle.radius * max(k.width, k.height))
-        if across < k.width:  # the image is wider than its circle
-            k = replace(k, width=across, cx=across / 2)
     angle = field_of_view(k)
     return (
         f"{camera.model} of {images} photographs, {camera.width}x{camera.height}, f = {focal:.0f} px "

@@ -5,9 +5,8 @@ Masks are rotated and downscaled with their photographs. COLMAP ignores features
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from PIL import Image
@@ -17,10 +16,8 @@ from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size, read_mask, write_image
 from gs2d.data.masks import FOLDER, Masks, find_masks, find_masks_in
 from gs2d.errors import DataError
-from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.photos import Photo, turn
 
-_NONE: Mapping[str, Circle] = MappingProxyType({})
 _ASPECT = 0.01  # largest relative difference of the aspect ratios of a mask and its photograph
 
 
@@ -53,19 +50,8 @@ def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[
     return find_masks(names, images, [own.get(image) for image in images], [root, root.resolve().parent], Masks(folder))
 
 
-def copy_masks(
-    photos: Sequence[Photo],
-    masks: Sequence[Path | None],
-    folder: Path,
-    max_size: int | None,
-    circles: Mapping[str, Circle] = _NONE,
-) -> int:
+def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Path, max_size: int | None) -> int:
     """Write masks as ``folder/NAME.png`` with the size of the copied images; returns their number.
-
-    Parameters
-    ----------
-    circles : dict of str to Circle
-        Image circles by name; pixels outside are masked, too.
 
     Raises
     ------
@@ -74,8 +60,7 @@ def copy_masks(
     """
     count, kept = 0, False
     for photo, path in zip(photos, masks, strict=True):
-        circle = circles.get(photo.name)
-        if path is None and circle is None:
+        if path is None:
             continue
         target = folder / f"{photo.name}.png"
         if target.exists():  # from an interrupted search
@@ -85,10 +70,7 @@ def copy_masks(
             target.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise disk_error(target.parent, error) from error
-        size = photo.size_within(max_size)
-        mask = np.ones(size[::-1], bool) if path is None else _resized(_upright(photo, path), size)
-        if circle is not None:
-            mask = mask & circle.inside(*size)
+        mask = _resized(_upright(photo, path), photo.size_within(max_size))
         write_image(target, mask)
         count, kept = count + 1, kept or bool(mask.any())
     if count == len(photos) and not kept:

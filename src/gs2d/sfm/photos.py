@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from PIL import Image
 
 from gs2d.core.image_arrays import is_twice_as_wide, natural_key
@@ -18,8 +17,7 @@ from gs2d.data.image_files import read_image
 from gs2d.data.masks import FOLDER, without_masks
 from gs2d.data.photo_formats import AVIF, EXR, HEIF, UNREAD, remedy
 from gs2d.errors import DataError
-from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
-from gs2d.sfm.panoramas import PANORAMA, meets_itself
+from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.video_frames import VIDEOS
 
 JPEG, PNG = (".jpg", ".jpeg"), (".png",)
@@ -29,7 +27,6 @@ _KINDS = {
     for kind, suffixes in (("unread", UNREAD), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))
     for suffix in suffixes
 }
-FISHEYE = "OPENCV_FISHEYE"  # value of --camera-model
 FEWEST = 3  # a point that two images show must be confirmed by a third
 _HIDDEN = (".", "__MACOSX")
 _ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: operation that makes the stored pixels upright
@@ -60,10 +57,6 @@ class Photo:
         Width and height of the upright image, px.
     taken : Taken
         Metadata of the file; ``orientation`` is the rotation that remains to be applied.
-    is_sphere : bool
-        Whether the image looks like a whole sphere (``panoramas.meets_itself``).
-    dark : ndarray float32 [h, w] or None
-        Downscaled upright image, if its corners are dark (``fisheye.small_if_dark``).
     """
 
     source: Path
@@ -71,8 +64,6 @@ class Photo:
     name: str
     size: tuple[int, int]
     taken: Taken
-    is_sphere: bool = False
-    dark: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def orientation(self) -> int:
@@ -190,16 +181,12 @@ def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[
 
 
 def _read(path: Path, root: Path, name: str) -> Photo:
-    image = read_image(path)
-    height, width = image.shape[:2]
+    height, width = read_image(path).shape[:2]
     taken = read_taken(path)
     orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else taken.orientation  # Pillow rotates TIFF itself
     size = (height, width) if orientation >= 5 else (width, height)
     taken = replace(taken, orientation=orientation)
-    dark = small_if_dark(image)
-    if dark is not None:
-        dark = np.asarray(turn(Image.fromarray(dark), orientation))
-    return Photo(path, path.relative_to(root).as_posix(), name, size, taken, meets_itself(image), dark)
+    return Photo(path, path.relative_to(root).as_posix(), name, size, taken)
 
 
 def _names(labels: Sequence[str]) -> list[str]:
@@ -258,7 +245,7 @@ def panorama_groups(
     groups : sequence of sequences of int
         Indices of photographs, one group per camera.
     camera_model : str
-        "auto" tests the images, ``PANORAMA`` means that all are panoramas, other values that none is.
+        "auto" reads the XMP of the images, ``PANORAMA`` means that all are panoramas, other values that none is.
 
     Raises
     ------
@@ -271,8 +258,7 @@ def panorama_groups(
     for group in groups:
         first = photos[group[0]]
         said = [photos[i].taken.panorama for i in group]
-        looks = 2 * sum(photos[i].is_sphere for i in group) >= len(group)
-        is_one = camera_model == PANORAMA or "whole" in said or looks
+        is_one = camera_model == PANORAMA or "whole" in said
         if "part" in said:
             raise _not_whole(photos[group[said.index("part")]], "as its XMP says")
         if is_one and not is_twice_as_wide(*first.size):
@@ -284,43 +270,10 @@ def panorama_groups(
     lines = [about] if count else []
     if doubted:
         lines.append(
-            f"{doubted} photographs have an aspect ratio of 2:1, but their edges do not fit together: not treated as "
-            f"panoramas (use --camera-model {PANORAMA} if they are)"
+            f"{doubted} photographs have an aspect ratio of 2:1, but no XMP tag of panoramas: not treated as panoramas "
+            f"(use --camera-model {PANORAMA} if they are)"
         )
     return found, lines
-
-
-def fisheye_hints(
-    photos: Sequence[Photo], groups: Sequence[Sequence[int]], panoramas: Sequence[bool], camera_model: str
-) -> tuple[list[tuple[str, Circle | None]], list[str]]:
-    """Return hints that groups of photographs are fisheye images, and messages.
-
-    Parameters
-    ----------
-    panoramas : sequence of bool
-        Whether each group consists of panoramas.
-    camera_model : str
-        "auto" tests the images, "OPENCV_FISHEYE" means that all are fisheye images, other values that none is.
-
-    Returns
-    -------
-    list of (str, Circle or None)
-        For each group the hint (see :class:`gs2d.sfm.colmap_process.Group`) and the image circle.
-    list of str
-        Messages.
-    """
-    if camera_model not in ("auto", FISHEYE):
-        return [("", None)] * len(groups), []
-    hints: list[tuple[str, Circle | None]] = []
-    round_ones = 0
-    for group, is_panorama in zip(groups, panoramas, strict=True):
-        circle = None if is_panorama else circle_of([photos[i].dark for i in group])
-        named = not is_panorama and named_fisheye(photos[group[0]].taken.made_by)
-        hint = "asked" if camera_model == FISHEYE else "circle" if circle else "name" if named else ""
-        hints.append((hint, circle))
-        round_ones += len(group) if circle else 0
-    line = f"{round_ones} photographs have an image circle: pixels outside are masked and not trained"
-    return hints, [line] if round_ones else []
 
 
 def _not_whole(photo: Photo, why: str) -> DataError:

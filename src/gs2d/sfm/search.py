@@ -22,7 +22,7 @@ LAYERS = ("photographs", "features", "pairs", "mapping")
 DATABASE, MAPPING = "database.db", "mapping"
 _PAIRS = ("pairs.txt", "pairs_anew.txt", "alike.json")
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # errors of a damaged database
-HINTED = "hinted"  # step of the mapping, before images are placed: cameras that may be fisheyes
+FISHEYES = "fisheyes"  # step of the mapping, before images are placed
 CALIBRATED_ANEW = "calibrated anew"  # step of the mapping: pairs are verified again with other cameras
 
 
@@ -113,7 +113,7 @@ def _kept(work: Path, layers: int) -> str:
         if layers > LAYERS.index("pairs"):
             parts.append(f"{_count(connection, 'two_view_geometries'):,} pairs")
     if layers > LAYERS.index("mapping") and (work / MAPPING).is_dir():
-        steps = {path.stem for path in (work / MAPPING).iterdir()} - {HINTED, CALIBRATED_ANEW}
+        steps = {path.stem for path in (work / MAPPING).iterdir()} - {FISHEYES, CALIBRATED_ANEW}
         parts += ["placed cameras"] if steps else []
     return f"continuing the interrupted search: {', '.join(parts) or 'copies of photographs'}"
 

@@ -164,7 +164,7 @@ class PoseEstimation:
     """Photographs that share a camera: those with equal folder, size, camera, lens and focal length (auto), all, or
     none."""
     camera_model: LensModel = "auto"
-    """Lens model (auto: the simplest that fits)."""
+    """Lens model (auto: radial distortion, with two coefficients from 8 photographs of a camera on)."""
     matching: Literal["auto", "exhaustive", "sequential", "similar", "spatial"] = "auto"
     """Image pairs to match: all (exhaustive), consecutive, similar, or spatially near ones. auto: all up to 150
     photographs, else spatial if most have positions, else similar."""

@@ -26,20 +26,18 @@ from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.photo_positions import metric_positions
 from gs2d.pipeline.run_parts import PLACED
+from gs2d.sfm.as_fisheye import FISHEYE
 from gs2d.sfm.colmap_process import Group, Request, Solved, check_installed, layers, read_facts, solve
-from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.lens import START, lens_line
+from gs2d.sfm.lens import START
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
 from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.photo_masks import copy_masks, masks_of
 from gs2d.sfm.photos import (
     FEWEST,
-    FISHEYE,
     Photo,
     camera_groups,
     find_photos,
-    fisheye_hints,
     in_order_taken,
     panorama_groups,
     read_photos,
@@ -124,12 +122,12 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             masks = _masks_of(options, photos, video is not None, on_event)
             source |= {"masks": [_stamp(mask) for mask in masks if mask is not None]} if any(masks) else {}
             request = _request(options, work, photos, threads, on_event)
-            capture, circles = work / STAGED, _circles(request)
-            if (any(masks) or circles) and not options.match_masked:
+            capture = work / STAGED
+            if any(masks) and not options.match_masked:
                 request = replace(request, masks=str(capture / FOLDER))
             if line := go_on(work, {"photographs": source, **layers(request)}, ours=(STAGED,)):
                 on_event(Notice(line))
-            masked = copy_masks(photos, masks, capture / FOLDER, options.max_size, circles)
+            masked = copy_masks(photos, masks, capture / FOLDER, options.max_size)
             staged = _stage(photos, capture / IMAGES, options, threads, on_event, is_video=video is not None)
             solved = solve(request, _progress(on_event), lambda line: on_event(Notice(line)))
             try:
@@ -150,9 +148,6 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     except BaseException:
         remove_made(made)
         raise
-    lens = result["lens"]
-    if lens["about"]:
-        on_event(Notice(lens["about"], detail=not lens.get("fisheyes")))
     for line in _warnings(result):
         on_event(Notice(line))
     return {"capture": str(options.out), **result}
@@ -285,10 +280,9 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
     sizes = [photo.size_within(options.max_size) for photo in photos]
     groups = camera_groups(photos, sizes, options.cameras)
     panoramas, lines = panorama_groups(photos, groups, options.camera_model)
-    hints, more = fisheye_hints(photos, groups, panoramas, options.camera_model)
-    for line in (*lines, *more):
+    for line in lines:
         on_event(Notice(line))
-    # Requested fisheyes are set later: COLMAP verifies no pair of fisheyes with unknown focal length.
+    # Fisheyes are set later: COLMAP verifies no pair of fisheyes with unknown focal length.
     lens = START if options.camera_model in ("auto", FISHEYE) else options.camera_model
     order, ordered_by = in_order_taken(photos)
     known = sum(position is not None for position in positions)
@@ -302,10 +296,8 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
                 PANORAMA if is_panorama else lens,
                 sizes[group[0]],
                 str(photos[group[0]].source.resolve()),
-                hint,
-                (circle.x, circle.y, circle.radius) if circle else None,
             )
-            for group, is_panorama, (hint, circle) in zip(groups, panoramas, hints, strict=True)
+            for group, is_panorama in zip(groups, panoramas, strict=True)
         ),
         in_order=tuple(photos[i].name for i in order),
         ordered_by=ordered_by,
@@ -319,11 +311,6 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
         seed=options.seed,
         asked_lens=None if options.camera_model == "auto" else options.camera_model,
     )
-
-
-def _circles(request: Request) -> dict[str, Circle]:
-    """Return the image circles of circular fisheye photographs, by name."""
-    return {name: Circle(*group.circle) for group in request.groups if group.circle for name in group.names}
 
 
 def _matching(requested: str, count: int, known: int) -> str:
@@ -384,8 +371,8 @@ def _read_models(
         "photos_per_point": best.mean_track,
         "median_angle_degrees": best.median_angle,
         "up": "+z" if best.upright else None,
-        "cameras": [_camera_facts(best, number, count, request) for number, count in sorted(per_camera.items())],
-        "lens": {**solved.lens, "about": lens_line(solved.lens)},
+        "cameras": [_camera_facts(best, number, count) for number, count in sorted(per_camera.items())],
+        "lens": solved.lens,
         "other_models": [
             {"folder": f"{SPARSE}/{i}", "photos": sorted(model.names), "points": len(model.points.xyz)}
             for i, model in enumerate(models[1:], start=1)
@@ -403,17 +390,16 @@ def _read_models(
     }
 
 
-def _camera_facts(model: SfmModel, number: int, count: int, request: Request) -> dict[str, Any]:
+def _camera_facts(model: SfmModel, number: int, count: int) -> dict[str, Any]:
     """Return the entry of a camera in ``poses.json``."""
-    camera, circles = model.cameras[number], _circles(request)
-    circle = next((circles.get(image.name) for image in model.images if image.camera_id == number), None)
+    camera = model.cameras[number]
     return {
         "model": camera.model,
         "size": [camera.width, camera.height],
         "params": list(camera.params),
         "focal_px": focal_length(camera),
         "photos": count,
-        "about": camera_line(camera, count, circle),
+        "about": camera_line(camera, count),
     }
 
 
