@@ -1,4 +1,4 @@
-"""``gs2d render --orbit N | --flight N --video FILE``."""
+"""``gs2d render --orbit N --video FILE``."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from cli_runs import one_line
 from gs2d.cli import run
 
 
-def test_a_flight_becomes_images_and_a_video(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_orbit_becomes_images_and_a_video(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy, video = tmp_path / "run", tmp_path / "video.webp"
     shutil.copytree(trained, copy)
-    words = ["--flight", "5", "--video", str(video), "--set", "fps=10", "--threads", "1"]
+    words = ["--orbit", "5", "--video", str(video), "--set", "fps=10", "--threads", "1"]
     assert run(["render", str(copy), *words]) == 0
     out, err = capsys.readouterr()
     assert "5 images in" in out
     assert f"{video}: 0.5 s, 0.0 MB" in out
     assert "compressing the video (5)" in err
-    assert len(list((copy / "renders" / "flight").glob("*.png"))) == 5
+    assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 5
     with Image.open(video) as images:
         assert (images.size, images.n_frames) == ((20, 20), 5)  # type: ignore[attr-defined]
     assert run(["render", str(copy), "--orbit", "2", "--video", str(video), "--json", "--threads", "1"]) == 0
@@ -55,8 +55,7 @@ def test_a_video_without_a_suffix_gets_an_available_format_and_mp4_needs_ffmpeg(
     [
         (["--video", "a.webp"], "--orbit"),
         (["--orbit", "0", "--video", "a.webp"], "N >= 2"),
-        (["--orbit", "9", "--flight", "9"], "exclude"),
-        (["--flight", "-1"], "number"),
+        (["--orbit", "-1"], "number"),
         (["--orbit", "9", "--set", "fps=25"], "--video"),
         (["--orbit", "9", "--video", "a.mov"], "name"),
         (["--orbit", "1", "--video", "a.webp"], "frames"),

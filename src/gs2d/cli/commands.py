@@ -111,7 +111,7 @@ class MeshCommand(TextureOptions, MeshOptions, Common):
     "render",
     action="gs2d.cli.handlers:render",
     group=LOOK,
-    first=("run", "split", "orbit", "flight", "width", "video", "out"),
+    first=("run", "split", "orbit", "width", "video", "out"),
 )
 @dataclass(frozen=True, kw_only=True)
 class RenderCommand(RenderOptions, Common):
@@ -120,7 +120,7 @@ class RenderCommand(RenderOptions, Common):
     run: RunPath
     """Run folder."""
     out: Path | None = None
-    """Folder of the images (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
+    """Folder of the images (default: renders/SPLIT or renders/orbit in the run)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Use the splats of this file, in the frame of the run. Needs --out."""
     memory: MemoryOption = None

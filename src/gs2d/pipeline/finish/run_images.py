@@ -34,7 +34,7 @@ from gs2d.io.run_dir import (
     remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.finish.camera_paths import flight_cameras, orbit_cameras
+from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
@@ -58,7 +58,7 @@ INDEX = "index.json"
 LONGEST_NAME = 180  # bytes; file systems allow 255, including the kind of image and a temporary suffix
 IMAGES = ("color", "normal", "depth", "error", "high_error")
 SHOWN_VIEWS = 3  # rendered after each stage for the report
-MAX_FRAMES = 100_000  # of an orbit or a flight
+MAX_FRAMES = 100_000  # of an orbit
 MAX_WIDTH = 1 << 14  # px
 
 
@@ -193,14 +193,14 @@ def render_run(
     splats_file: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Render the views of a split, an orbit or a flight as PNG files, and optionally as a video.
+    """Render the views of a split or an orbit as PNG files, and optionally as a video.
 
     ``splats_file`` is drawn instead of the splats of the run, into ``out``.
     """
     from gs2d.io.video import write_video
 
     path, out = Path(path), None if out is None else Path(out)
-    moving, video = check_frames(options)
+    video = check_frames(options)
     if video is not None and video != options.video and video.suffix == ".webp":
         on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
     run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
@@ -214,7 +214,7 @@ def render_run(
     folder = out or run.file(RENDERS) / kind
     made = make_folder(folder)
     with _alone_in(folder) if out is None else contextlib.nullcontext():
-        if moving and out is None:  # remove the frames of a longer video
+        if options.orbit and out is None:  # remove the frames of a longer video
             for old in folder.glob("[0-9]*.png"):
                 if old.stem.isdecimal():
                     old.unlink()
@@ -237,7 +237,7 @@ def render_run(
             return result
         on_event(Phase("compressing the video", len(views)))
         frames = [folder / f"{name}.png" for name, _ in views]
-        with attempted(str(video), again("render", path, f"--{moving}", len(views), "--video", video), on_event):
+        with attempted(str(video), again("render", path, "--orbit", len(views), "--video", video), on_event):
             threads = torch.get_num_threads()
             write_video(video, frames, fps=options.fps, threads=threads, on_frame=lambda done: on_event(Step(done)))
             result |= {"video": str(video), "seconds": len(views) / options.fps, "video_bytes": video.stat().st_size}
@@ -249,17 +249,12 @@ def _views(
 ) -> tuple[str, list[tuple[str, View]]]:
     """Return the name of the folder, and the views with their file names."""
     scene, split = loaded.scene, options.split
-    if options.orbit or options.flight:
-        cameras = [view.camera for view in scene.train]
-        if options.flight:
-            path_cameras = flight_cameras(cameras, options.flight)
-        else:
-            subject = read_subject(path)
-            focus = None if subject is None or subject.kind != OBJECT else subject.center
-            path_cameras = orbit_cameras(cameras, options.orbit, focus)
+    if options.orbit:
+        subject = read_subject(path)
+        focus = None if subject is None or subject.kind != OBJECT else subject.center
+        orbit = orbit_cameras([view.camera for view in scene.train], options.orbit, focus)
         empty = np.zeros((1, 1, 3), np.uint8)
-        numbered = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, empty)) for i, camera in enumerate(path_cameras)]
-        return "flight" if options.flight else "orbit", numbered
+        return "orbit", [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, empty)) for i, camera in enumerate(orbit)]
     if split is None and not scene.test:
         split = "train"
         on_event(Notice("rendering the training views, because the run has no test views"))
@@ -286,27 +281,24 @@ def _alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
-def check_frames(options: RenderOptions) -> tuple[str, Path | None]:
-    """Return the kind of camera path ("orbit", "flight" or "") and the path of the video; raise for invalid options."""
+def check_frames(options: RenderOptions) -> Path | None:
+    """Return the path of the video, if there is one; raise for invalid options."""
     from gs2d.io.video import check_video
 
-    orbit, flight, width, video = options.orbit, options.flight, options.width, options.video
+    orbit, width, video = options.orbit, options.width, options.video
     if width is not None and not (isinstance(width, int) and 1 <= width <= MAX_WIDTH):
         raise RunError(f"--width must be a number of pixels from 1 to {MAX_WIDTH}, got {width}")
-    for name, frames in (("--orbit", orbit), ("--flight", flight)):
-        if not (isinstance(frames, int) and 0 <= frames <= MAX_FRAMES):
-            raise RunError(f"{name} must be a number of frames from 1 to {MAX_FRAMES}, got {frames}")
-    if orbit and flight:
-        raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; use one")
+    if not (isinstance(orbit, int) and 0 <= orbit <= MAX_FRAMES):
+        raise RunError(f"--orbit must be a number of frames from 1 to {MAX_FRAMES}, got {orbit}")
     if video is None:
         if options.fps != RenderOptions.fps:
             raise RunError(f"fps={options.fps:g} needs --video")
     else:
-        if not (orbit or flight):
-            raise RunError("--video needs --orbit N or --flight N, N >= 2")
-        video = check_video(video, options.fps, orbit or flight)
+        if not orbit:
+            raise RunError("--video needs --orbit N, N >= 2")
+        video = check_video(video, options.fps, orbit)
         check_writable(video)
-    return "orbit" if orbit else "flight" if flight else "", video
+    return video
 
 
 def _spare_photographs(files: Sequence[Path], option: str, loaded: LoadedRun) -> None:

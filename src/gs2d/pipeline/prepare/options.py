@@ -305,12 +305,10 @@ class RenderOptions:
     """Views to render (default: test views, or training views where there are none)."""
     orbit: int = 0
     """Render N frames of a circle around the subject, or of an arc if only one side was photographed."""
-    flight: int = 0
-    """Render N frames of a smooth flight along the cameras."""
     width: Annotated[int | None, Arg(metavar="PIXELS")] = None
     """Image width; the height follows (default: as in training)."""
     video: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """With --orbit or --flight: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
+    """With --orbit: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
     fps: Annotated[float, SETTING] = 30.0
     """Frames per second of the video."""
 
