@@ -70,14 +70,11 @@ class PosesCommand(PosesOptions, Common):
     "train",
     action="gs2d.cli.handlers:train",
     group=STEPS,
-    first=("scene", "out", "quality", "recipe", "downscale", "dry_run", "viewer", "resume", "overwrite"),
+    first=("scene", "out", "quality", "recipe", "downscale", "viewer", "resume", "overwrite"),
 )
 @dataclass(frozen=True, kw_only=True)
 class TrainCommand(TrainOptions, Common):
     """Train on photographs whose cameras are known."""
-
-    dry_run: bool = False
-    """Only estimate splats, memory, disk and time. Needs no --out."""
 
 
 @register_command(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,26 +26,12 @@ def _keep_to(gib: float | None) -> None:
 
 def train(command: c.TrainCommand, console: Console) -> None:
     """``gs2d train``."""
-    if command.dry_run:
-        _estimate(command, console)
-        return
     from gs2d.pipeline.train.train_run import train as run_training
 
     run = run_training(command, console.on_event)
     console.close()
     if process_rank().leads:  # one process of several prints
         show_run(run.path, run.metrics(), console)
-
-
-def _estimate(command: c.TrainCommand, console: Console) -> None:
-    """Show the estimate of a training."""
-    from gs2d.pipeline.prepare.estimate import plan
-
-    estimate = plan(command, console.on_event)
-    console.close()
-    for line in estimate.lines():
-        console.say(line)
-    console.result(asdict(estimate))
 
 
 def mesh(command: c.MeshCommand, console: Console) -> None:

@@ -96,8 +96,6 @@ def _field_values(name: str, words: Sequence[str]) -> dict[str, Any]:
         raise UsageError(f"unexpected {rest[0]!r}: the command takes {takes}")
     values = {field: value for field, value in vars(parsed).items() if value not in (None, [])}
     values |= _settings(values.pop(_OVERRIDES, ()), options, trains)
-    if values.get("dry_run"):
-        values.setdefault("out", Path("RUN"))  # nothing is written
     if missing := [option.usage for option in options if option.required and option.field not in values]:
         raise UsageError(f"gs2d {name} needs {' and '.join(missing)}")
     return values

@@ -22,10 +22,7 @@ from train_toys import backends, make_scene
 SCENE = make_scene()
 SETTLED = Settled(SCENE, get_recipe("best"), GENERIC, get_backend(backends()[-1]), "digest")
 OPTIONS = TrainOptions(scene=Path("capture"), out=Path("job"))
-PLAN = Estimate(
-    photographs=6, pixels=1, downscale=1, iterations=1, start=1_000_000, splats=Range(1, 2, 3), max_splats=None,
-    memory=Range(1, 2, 3), allowed=None, prepared=False, disk=1, seconds=Range(1, 2, 3),
-)  # fmt: skip
+PLAN = Estimate(start=1_000_000, max_splats=None, memory=Range(1, 2, 3), seconds=Range(1, 2, 3))
 
 
 def fitting(monkeypatch: pytest.MonkeyPatch, plan: Estimate | DataError, partition: Partition) -> Partition | None:

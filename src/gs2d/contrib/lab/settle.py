@@ -126,9 +126,7 @@ def fitting_partition(
     found: Estimate | None = None
     recipe = settled.recipe
     try:
-        found = estimate(
-            settled.scene, recipe, settled.backend, downscale=(options.downscale or 1), prepare=options.prepare
-        )
+        found = estimate(settled.scene, recipe, settled.backend, downscale=(options.downscale or 1))
     except DataError as error:
         on_event(Notice(f"one training does not fit: {error}"))
     if found is not None and found.max_splats is None:

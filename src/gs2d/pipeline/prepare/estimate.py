@@ -1,4 +1,4 @@
-"""Estimate a training by arithmetic from the capture and the recipe: splats, memory, disk and time.
+"""Estimate time and memory of a training by arithmetic from the capture and the recipe.
 
 The number of splats is the least certain: it depends on what the photographs show. The constants were compared with
 ten finished runs (docs/notebook/scale.md). Work is counted in units of the time in which the rasterizer renders one
@@ -22,27 +22,19 @@ from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.core.text import duration
 from gs2d.data import Scene
-from gs2d.data.prepared import decoded_bytes, packed_bytes
+from gs2d.data.prepared import decoded_bytes
 from gs2d.errors import DataError
-from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES, use_memory, use_threads
-from gs2d.pipeline.prepare.loaded import read_init
-from gs2d.pipeline.prepare.open_capture import open_capture
-from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES
 from gs2d.pipeline.prepare.photographs import fits
-from gs2d.pipeline.prepare.resolve import check_options, resolve, schedule_scale_of
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.events import OnEvent, ignore
 from gs2d.training.start.plane_sweep import MAX_VIEWS, sweep_downscale
 
 # Bytes
 PROGRAM_BYTES = 384 << 20  # torch, the kernels, the scene
 SPLAT_BYTES = 1200  # parameters, moments, gradients and rasterizer state of a splat (docs/notebook/performance.md)
 FUSION_BYTES = 220 << 20  # a slab of the volume and its surface, after the gradients are freed
-CHECKPOINT_BYTES = 59 * 3 * 4  # of a splat; two checkpoints are kept
-FILE_BYTES = 4 * 61 + 80 + 40  # of a splat: splats.ply, scene.html, the mesh
-TEMPORARY_BYTES = 8  # of a pixel: depth maps
 GROWTH = (0.5, 3.0, 9.0)  # final over initial number of splats in the finished runs: least, expected, most
 # Work, in units
 PIXEL_WORK = 1.2  # of an iteration, per pixel: rendering, losses, gradients
@@ -69,94 +61,34 @@ class Estimate:
 
     Attributes
     ----------
-    photographs, pixels : int
-        Training size, all photographs together.
-    downscale, iterations : int
     start : int
         Initial splats.
-    splats : Range
-        Final splats.
     max_splats : int or None
         Largest number of splats that fits into memory, where that limits them.
     memory : Range
-        Bytes; ``allowed`` is the limit.
-    allowed : int or None
-    prepared : bool
-        Whether photographs are kept on disk, undistorted and shrunk.
-    disk : float
-        Bytes, including temporary files.
+        Bytes.
     seconds : Range
         Of the whole run.
     """
 
-    photographs: int
-    pixels: int
-    downscale: int
-    iterations: int
     start: int
-    splats: Range
     max_splats: int | None
     memory: Range
-    allowed: int | None
-    prepared: bool
-    disk: float
     seconds: Range
 
     def line(self) -> str:
         """Return time and memory in one line."""
-        return (
-            f"the run will take about {duration(self.seconds.least)} to {duration(self.seconds.most)} and "
-            f"{self.memory.least / 2**30:.2g} to {self.memory.most / 2**30:.2g} GiB of memory"
-        )
-
-    def lines(self) -> list[str]:
-        """Return the estimate as text."""
-        shrunk = f" (--downscale {self.downscale})" if self.downscale > 1 else ""
-        where = "prepared on disk" if self.prepared else "in memory"
-        allowed = "" if self.allowed is None else f" of {self.allowed / 2**30:.3g} GiB allowed"
         limit = ""
         if self.max_splats is not None:
-            limit = f"; more do not fit: use --set STAGE.densify.max_splats={self.max_splats} or more --memory"
-        least, expected, most = (value / 2**30 for value in self.memory)
-        return [
-            f"photographs: {self.photographs:,} with {self.pixels / 1e6:.3g} megapixels in total{shrunk}, {where}",
-            f"splats: {rounded(self.splats.expected):,} ({rounded(self.splats.least):,} to "
-            f"{rounded(self.splats.most):,}), initially {rounded(self.start):,}{limit}",
-            f"memory: {expected:.2g} GiB ({least:.2g} to {most:.2g}){allowed}",
-            f"disk: {self.disk / 2**30:.2g} GiB",
-            f"time: {duration(self.seconds.expected)} ({duration(self.seconds.least)} to "
-            f"{duration(self.seconds.most)}), {self.iterations:,} iterations, mesh and report",
-        ]
-
-
-def plan(options: TrainOptions, on_event: OnEvent = ignore) -> Estimate:
-    """Estimate the training that ``gs2d train`` would run with these options; nothing is trained or written.
-
-    Raises
-    ------
-    Gs2dError
-        If the capture cannot be read, or the training does not fit into memory.
-    """
-    check_options(options)
-    use_threads(options.threads)
-    use_memory(options.memory)
-    start = None if options.init is None else len(read_init(options.init, on_event)[0])
-    capture = open_capture(options, on_event)
-    scale = schedule_scale_of(options, capture)
-    recipe, capture = resolve(options, capture, on_event, seed=options.seed, schedule_scale=scale)
-    return estimate(
-        capture.scene, recipe, capture.backend, downscale=capture.downscale, prepare=options.prepare, start=start
-    )
+            limit = f"; more than {self.max_splats:,} splats do not fit (--set STAGE.densify.max_splats limits them)"
+        return (
+            f"the run will take about {duration(self.seconds.least)} to {duration(self.seconds.most)} and "
+            f"{self.memory.least / 2**30:.2g} to {self.memory.most / 2**30:.2g} GiB of memory{limit}"
+        )
 
 
 def estimate(
-    scene: Scene,
-    recipe: Recipe,
-    backend: Backend,
-    *,
-    downscale: int = 1,
-    prepare: str = "auto",
-    start: int | None = None,
+    scene: Scene, recipe: Recipe, backend: Backend, *, downscale: int = 1, start: int | None = None
 ) -> Estimate:
     """Estimate the training of a scene.
 
@@ -167,8 +99,6 @@ def estimate(
     backend : Backend
     downscale : int
         Factor by which the photographs are smaller than their files.
-    prepare : str
-        "auto", "always" or "never", as in ``TrainOptions``.
     start : int, optional
         Initial number of splats, if known.
 
@@ -180,10 +110,9 @@ def estimate(
     allowed = memory_budget()
     start = initial_splats(scene, recipe) if start is None else start
     splats, budget = expected_splats(recipe, start), None
-    prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
-    sizes = [view.camera.width * view.camera.height for view in scene.views]
-    fixed = PROGRAM_BYTES + max(sizes) * (ITERATION_BYTES * backend.on_host + DECODING_BYTES * downscale**2)
-    fixed += FUSION_BYTES + (0 if prepared else decoded_bytes(scene))
+    largest = max(view.camera.width * view.camera.height for view in scene.views)
+    fixed = PROGRAM_BYTES + largest * (ITERATION_BYTES * backend.on_host + DECODING_BYTES * downscale**2)
+    fixed += FUSION_BYTES + (decoded_bytes(scene) if fits(scene) else 0)
     if allowed is not None and fixed + splats.most * SPLAT_BYTES > allowed:
         budget = int((allowed - fixed) / SPLAT_BYTES)
         if budget < start:
@@ -195,21 +124,8 @@ def estimate(
         splats = Range(*(min(count, budget) for count in splats))
         budget = None if splats.most < budget else rounded(0.95 * budget)
     memory = Range(*(fixed + count * SPLAT_BYTES for count in splats))
-    disk = (packed_bytes(scene.views) if prepared else 0.0) + TEMPORARY_BYTES * sum(sizes)
-    return Estimate(
-        photographs=len(scene.views),
-        pixels=sum(sizes),
-        downscale=downscale,
-        iterations=recipe.iterations,
-        start=start,
-        splats=splats,
-        max_splats=budget,
-        memory=memory._replace(least=memory.least - FUSION_BYTES / 2),  # a small surface needs half
-        allowed=allowed,
-        prepared=prepared,
-        disk=disk + splats.expected * (2 * CHECKPOINT_BYTES + FILE_BYTES),
-        seconds=_seconds(scene, recipe, start, splats, rasterizer_speed(backend)),
-    )
+    memory = memory._replace(least=memory.least - FUSION_BYTES / 2)  # a small surface needs half
+    return Estimate(start, budget, memory, _seconds(scene, recipe, start, splats, rasterizer_speed(backend)))
 
 
 # -- splats ------------------------------------------------------------------------------------------------------------

@@ -265,7 +265,6 @@ def _estimate_line(loaded: LoadedRun) -> str:
         loaded.recipe,
         loaded.backend,
         downscale=loaded.downscale,
-        prepare=loaded.resolved.execution.prepare,
         start=None if loaded.init is None else len(loaded.init),
     ).line()
 
