@@ -5,18 +5,16 @@
     python -m benchmarks.scale FOLDER [--photographs 100 400 1600 6400] [--size 96] [--splats 20000] [--memory GIB]
 
 For each number, a flown capture (``benchmarks.flown_capture``) is made if missing. Training starts from ``--splats``
-splats on the true surface, with photographs prepared on disk. The run is then meshed in unbounded mode and its report
-is written. Each step is a separate command. Memory is the maximum resident sum of a command and its children, sampled
-fifty times a second. A hundred photographs show less of the land's edge than thousands, and a larger surface takes more
-memory. ``--land`` therefore limits the land to the area flown over, and ``--bbox`` also meshes a region that all
-captures show. Numbers listed in ``--compare`` are also trained with all data in memory, and must give identical bytes.
-The table is printed; figures are written to ``FOLDER/scale.json``.
+splats on the true surface. The run is then meshed and its report is written. Each step is a separate command. Memory is
+the maximum resident sum of a command and its children, sampled fifty times a second. A hundred photographs show less of
+the land's edge than thousands, and a larger surface takes more memory. ``--land`` therefore limits the land to the area
+flown over, and ``--bbox`` also meshes a region that all captures show. The table is printed; figures are written to
+``FOLDER/scale.json``.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import shutil
 import subprocess
@@ -106,10 +104,10 @@ def surface_splats(capture: Path, count: int) -> Splats:
     return found.splats
 
 
-def train_arguments(capture: Path, run: Path, args: argparse.Namespace, prepare: str) -> list[str]:
+def train_arguments(capture: Path, run: Path, args: argparse.Namespace) -> list[str]:
     """Return the options of a short training with a fixed number of splats."""
     words = ["train", capture, "--out", run, "--overwrite", "--init", capture / "start.ply", "--recipe", "2dgs"]
-    words += ["--robust", "off", "--set", "surface.densify=null", "--set", f"prepare={prepare}", "--quiet", "--scene"]
+    words += ["--robust", "off", "--set", "surface.densify=null", "--quiet", "--scene"]
     words += ["--schedule-scale", args.iterations / ITERATIONS_OF_ALL, "--memory", args.memory]
     words += ["--threads", args.threads]
     return [str(word) for word in words]
@@ -127,20 +125,13 @@ def run_one(folder: Path, photographs: int, args: argparse.Namespace) -> list[Me
     limits = ["--memory", str(args.memory), "--quiet"]
     log = folder / f"log-{photographs}.txt"
     found = [
-        measure(photographs, "train", train_arguments(capture, run, args, "always"), log),
+        measure(photographs, "train", train_arguments(capture, run, args), log),
         measure(photographs, "mesh", ["mesh", str(run), "--scene", "--threads", str(args.threads), *limits], log),
     ]
     if args.bbox:
         words = ["mesh", str(run), "--out", str(folder / f"part-{photographs}.ply"), "--threads", str(args.threads)]
         words += ["--bbox", *map(str, args.bbox), *limits]
         found.append(measure(photographs, "mesh of a part", words, log))
-    if photographs in args.compare:
-        other = folder / f"run-{photographs}-in-memory"
-        shutil.rmtree(other, ignore_errors=True)
-        found.append(measure(photographs, "train in memory", train_arguments(capture, other, args, "never"), log))
-        digests = {hashlib.sha256((path / "splats.ply").read_bytes()).hexdigest() for path in (run, other)}
-        if len(digests) != 1:
-            raise RuntimeError(f"{photographs} photographs, prepared and in memory: not the same splats.ply")
     return found
 
 
@@ -156,11 +147,10 @@ def table(found: list[Measured]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run all measurements; return 2 for user errors, 1 if bytes differ or a command fails."""
+    """Run all measurements; return 2 for user errors, 1 if a command fails."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--photographs", type=int, nargs="+", default=[100, 400, 1600, 6400])
-    parser.add_argument("--compare", type=int, nargs="*", default=[100])
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument(
         "--side", type=float, default=200.0, help="side of the area flown over, m, for any number of photographs"

@@ -52,7 +52,6 @@ INSIDE = {
     "data": {
         "load subject_box": 11,
         "known_captures": 10,
-        "prepared": 9,
         "readers": 8,
         "build": 7,
         "bounds reach": 6,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import tempfile
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,8 +103,41 @@ def test_the_cache_drops_the_least_recently_used_and_never_exceeds_its_bound() -
     assert (tiny.nbytes, len(tiny)) == (0, 0)
 
 
-def test_the_cache_is_safe_for_threads() -> None:
-    cache = ImageCache(300 * 5)
+def test_dropped_images_come_from_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def get(cache: ImageCache, value: int) -> DecodedImage:
+        def decode() -> DecodedImage:
+            made.append(value)
+            return replace(image(value), mask=np.full((10, 10), value % 2 == 0))
+
+        return cache.get(value, decode)
+
+    cache = ImageCache(900, spills=True)  # two images with masks
+    first = [get(cache, value) for value in range(5)]
+    again = [get(cache, value) for value in range(5)]
+    assert made == [0, 1, 2, 3, 4]
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+        np.testing.assert_array_equal(one.mask, other.mask)
+        assert not other.image.flags.writeable
+    cache.clear()
+    get(cache, 0)
+    assert made == [0, 1, 2, 3, 4]
+
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    cache = ImageCache(0, spills=True)
+    get(cache, 7)
+    get(cache, 7)
+    assert made[5:] == [7, 7]
+
+
+@pytest.mark.parametrize("spills", [False, True])
+def test_the_cache_is_safe_for_threads(spills: bool) -> None:
+    cache = ImageCache(300 * 5, spills=spills)
     wrong: list[int] = []
 
     def work(seed: int) -> None:

@@ -1,11 +1,10 @@
-"""A sequence with bounded memory use; the rest is in a temporary file."""
+"""Values in a temporary file, and a sequence with bounded memory use whose rest is in such a file."""
 
 from __future__ import annotations
 
 import os
 import pickle
 import tempfile
-import weakref
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from typing import IO, Any, Generic, TypeVar, overload
@@ -16,10 +15,42 @@ T = TypeVar("T")
 RECENT = 32  # values from the file that are cached: neighbouring views are requested again soon
 
 
-class Spilled(Sequence[T], Generic[T]):
-    """A sequence whose first values stay in memory up to ``limit_bytes``; later ones are pickled to a file.
+class SpillFile:
+    """Pickled values in an anonymous file, in the temporary folder (``TMPDIR``); it is deleted with the object."""
 
-    The file is anonymous, in the temporary folder (``TMPDIR``), and is deleted with the sequence.
+    def __init__(self) -> None:
+        self._file: IO[bytes] | None = None
+
+    def put(self, packed: bytes) -> tuple[int, int]:
+        """Write a pickled value, and return its place in the file.
+
+        Raises
+        ------
+        DiskError
+            If the file cannot be written.
+        """
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the object
+            place = (self._file.seek(0, os.SEEK_END), len(packed))
+            self._file.write(packed)
+            return place
+        except OSError as error:
+            raise DiskError(
+                f"cannot write a temporary file for data that does not fit in memory ({error.strerror or error}); free "
+                "some space, set TMPDIR to another folder, or allow more --memory",
+                error.errno,
+            ) from error
+
+    def get(self, place: tuple[int, int]) -> Any:
+        """Return the value at a place."""
+        assert self._file is not None
+        self._file.seek(place[0])
+        return pickle.loads(self._file.read(place[1]))  # an anonymous file of this process
+
+
+class Spilled(Sequence[T], Generic[T]):
+    """A sequence whose first values stay in memory up to ``limit_bytes``; later ones are in a ``SpillFile``.
 
     Parameters
     ----------
@@ -37,29 +68,15 @@ class Spilled(Sequence[T], Generic[T]):
         self._kept: list[T] = []
         self._slots: list[tuple[int, int]] = []
         self._recent: OrderedDict[int, T] = OrderedDict()
-        self._file: IO[bytes] | None = None
+        self._file = SpillFile()
         room = limit_bytes
         for value in values:
             packed = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
-            if self._file is None and len(packed) <= room:
+            if not self._slots and len(packed) <= room:
                 room -= len(packed)
                 self._kept.append(value)
             else:
-                self._put_away(packed)
-
-    def _put_away(self, packed: bytes) -> None:
-        try:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the sequence
-                weakref.finalize(self, self._file.close)
-            self._slots.append((self._file.seek(0, os.SEEK_END), len(packed)))
-            self._file.write(packed)
-        except OSError as error:
-            raise DiskError(
-                f"cannot write a temporary file for data that does not fit in memory ({error.strerror or error}); free "
-                "some space, set TMPDIR to another folder, or allow more --memory",
-                error.errno,
-            ) from error
+                self._slots.append(self._file.put(packed))
 
     def __len__(self) -> int:
         return len(self._kept) + len(self._slots)
@@ -82,10 +99,7 @@ class Spilled(Sequence[T], Generic[T]):
         if at in self._recent:
             self._recent.move_to_end(at)
             return self._recent[at]
-        assert self._file is not None
-        offset, size = self._slots[at - len(self._kept)]
-        self._file.seek(offset)
-        value: T = pickle.loads(self._file.read(size))  # an anonymous file of this process
+        value: T = self._file.get(self._slots[at - len(self._kept)])
         self._recent[at] = value
         if len(self._recent) > RECENT:
             self._recent.popitem(last=False)

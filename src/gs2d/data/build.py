@@ -18,7 +18,7 @@ from PIL import Image
 from gs2d.core.camera import Camera
 from gs2d.core.transforms import camera_extent, camera_outliers
 from gs2d.data.bounds import scene_bounds
-from gs2d.data.cache import DecodedImage, ImageCache
+from gs2d.data.cache import AHEAD, DecodedImage, ImageCache
 from gs2d.data.camera_models import model_of
 from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions, faces_of, wrapped
 from gs2d.data.file_names import in_any_case
@@ -295,7 +295,7 @@ def build_scene(
     if downscale < 1 or (test_every is not None and test_every < 0):
         raise DataError(f"downscale must be >= 1 and test_every >= 0, got {downscale} and {test_every}")
     factor = max(1, downscale // capture.downscaled_by)
-    cache = ImageCache(cache_bytes)
+    cache = ImageCache(cache_bytes, spills=True)
     lens_maps = functools.lru_cache(maxsize=4)(source_positions)  # 12 bytes per pixel; cameras are mostly shared
     frames, mask_notes, masks = _with_masks(capture, root, masks)
     frames = sorted((fit_to_file(frame) for frame in frames), key=lambda frame: frame.name)
@@ -314,6 +314,7 @@ def build_scene(
     except DataError as error:
         raise DataError(f"{error}{_explained(capture)}") from error
     points, point_notes = _finite_points(capture.points)
+    decoded = 3 * sum(view.camera.width * view.camera.height for view in (*train, *test))  # bytes
     bounds, bound_notes = scene_bounds(cameras, points, is_synthetic=capture.is_synthetic)
     return Scene(
         name=root.resolve().name,
@@ -333,6 +334,7 @@ def build_scene(
         notes=capture.notes + mask_notes + cut + map_notes + place_notes + point_notes + bound_notes,
         details=_lens_notes(frames),
         root=root,
+        ahead=AHEAD if decoded > cache_bytes else 0,
         masks=masks,
         own_split=any(frame.split for frame in frames),
         observe=_observed(capture, frames, points, {view.name: view.camera for view in (*train, *test)}),

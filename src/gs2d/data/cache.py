@@ -1,8 +1,9 @@
-"""A thread-safe, bounded cache of decoded images."""
+"""A thread-safe cache of decoded images, with bounded memory; the rest is in a temporary file."""
 
 from __future__ import annotations
 
 import contextlib
+import pickle
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -13,7 +14,10 @@ import numpy as np
 
 from gs2d.core.image_arrays import area_downscale, mask_downscale
 from gs2d.core.memory import trim
+from gs2d.core.spill import SpillFile
+from gs2d.errors import DiskError
 
+AHEAD = 8  # images that training requests in advance, if not all stay in memory
 TRIM_EVERY = 16  # decoded images between two calls of trim(), which take a few ms
 
 
@@ -67,14 +71,23 @@ class DecodedImage:
 
 
 class ImageCache:
-    """A least-recently-used cache of at most ``max_bytes``.
+    """A least-recently-used cache of at most ``max_bytes``; images that it drops go to a temporary file.
 
-    Larger images are returned without being stored. Decoding happens outside the lock: threads decode different images
+    Decoding, undistorting and shrinking a photograph takes much longer than reading the result from a file. Where that
+    file cannot be written, images are decoded again. Decoding happens outside the lock: threads decode different images
     in parallel; two threads that request the same image may both decode it.
+
+    Parameters
+    ----------
+    max_bytes : int
+    spills : bool
+        False: dropped images are decoded again.
     """
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(self, max_bytes: int, *, spills: bool = False) -> None:
         self.max_bytes = int(max_bytes)
+        self._file = SpillFile() if spills else None
+        self._places: dict[Hashable, tuple[int, int]] = {}  # in the file
         self._images: OrderedDict[Hashable, DecodedImage] = OrderedDict()
         self._nbytes = self._decoded = 0
         self._lock = threading.Lock()
@@ -88,7 +101,7 @@ class ImageCache:
         return len(self._images)
 
     def clear(self) -> None:
-        """Drop all images."""
+        """Drop all images from memory."""
         with self._lock:
             self._images.clear()
             self._nbytes = 0
@@ -100,19 +113,39 @@ class ImageCache:
             if held is not None:
                 self._images.move_to_end(key)
                 return held
+            if self._file is not None and key in self._places:
+                return self._keep(key, DecodedImage(*self._file.get(self._places[key])))
         image = decode()
         with self._lock:
             self._decoded += 1
             trims = self._decoded % TRIM_EVERY == 0
-            if key not in self._images and image.nbytes <= self.max_bytes:
-                self._images[key] = image
-                self._nbytes += image.nbytes
-                while self._nbytes > self.max_bytes:
-                    _, dropped = self._images.popitem(last=False)
-                    self._nbytes -= dropped.nbytes
+            self._keep(key, image)
         if trims:
             trim()
         return image
+
+    def _keep(self, key: Hashable, image: DecodedImage) -> DecodedImage:
+        """Keep an image in memory, and drop the oldest ones beyond the limit."""
+        if image.nbytes > self.max_bytes:
+            self._spill(key, image)
+        elif key not in self._images:
+            self._images[key] = image
+            self._nbytes += image.nbytes
+        while self._nbytes > self.max_bytes:
+            oldest, dropped = self._images.popitem(last=False)
+            self._nbytes -= dropped.nbytes
+            self._spill(oldest, dropped)
+        return image
+
+    def _spill(self, key: Hashable, image: DecodedImage) -> None:
+        """Write a dropped image to the file, once."""
+        if self._file is None or key in self._places:
+            return
+        try:
+            parts = (image.image, image.mask, image.object_mask, image.valid)
+            self._places[key] = self._file.put(pickle.dumps(parts, protocol=pickle.HIGHEST_PROTOCOL))
+        except DiskError:
+            self._file = None
 
 
 class ReadAhead:

@@ -246,8 +246,7 @@ class Scene:
     observe : callable or None
         Reads which sparse points each image observes; :meth:`observed` calls it.
     ahead : int
-        Number of images to read ahead, because they come from disk each time (``gs2d.data.prepared``); 0: images stay
-        in memory.
+        Number of images to read ahead, because not all stay in memory; 0: all do.
     masks : Masks
         Masks of the images and their meaning.
     own_split : bool

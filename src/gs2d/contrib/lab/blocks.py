@@ -170,7 +170,6 @@ class BlockTask(BlocksTask):
             views=block.views,
             start=load_start(coarse_folder(out) / SPLATS, start, recipe, region),
             extent=block.extent if partition.extent == "block" else None,
-            prepared=out,
         )
         run = self.train(part, block_folder(out, self.block), on_event)
         return {"stages": run.metrics()["stages"]}
@@ -202,7 +201,6 @@ class SeamsTask(BlocksTask):
                 protocol=settled.protocol,
                 views=views,
                 start=load_start(out / MERGED, start, recipe),
-                prepared=out,
             )
             self.train(part, seam_folder(out), on_event)
         return {"splats": write_result(settled, self.options, partition, on_event)}
@@ -326,7 +324,6 @@ def training_of(options: BlocksOptions) -> TrainOptions:
         threads=options.threads,
         resume=True,
         memory=options.memory,
-        prepare=options.prepare,
         **(values(CommonTraining, options) | {"overrides": options.recipe_changes}),
     )
 

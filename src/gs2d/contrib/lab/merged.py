@@ -28,7 +28,6 @@ from gs2d.pipeline.finish.scoring import PeakMemory, ScoreOptions, score_views, 
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import TrainOptions, values
-from gs2d.pipeline.prepare.photographs import with_prepared
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance, write_appearance
@@ -134,8 +133,7 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     run, memory = RunFolder(options.out), PeakMemory()
     if not run.file(SPLATS).exists():
         raise RunError(f"{options.out} must have {SPLATS}, found none; run the command again")
-    execution = Execution(**values(Execution, options))
-    scene = with_prepared(settled.scene, options.out, execution, on_event, shared=True)
+    scene = settled.scene
     loaded = merged_run(settled, options, scene)
     splats = read_splats(run.file(SPLATS)).to(loaded.backend.device)
     known = with_learned_appearance(run, loaded.recipe, scene)

@@ -22,10 +22,8 @@ from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.core.text import duration
 from gs2d.data import Scene
-from gs2d.data.prepared import decoded_bytes
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES
-from gs2d.pipeline.prepare.photographs import fits
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
@@ -110,9 +108,9 @@ def estimate(
     allowed = memory_budget()
     start = initial_splats(scene, recipe) if start is None else start
     splats, budget = expected_splats(recipe, start), None
-    largest = max(view.camera.width * view.camera.height for view in scene.views)
-    fixed = PROGRAM_BYTES + largest * (ITERATION_BYTES * backend.on_host + DECODING_BYTES * downscale**2)
-    fixed += FUSION_BYTES + (decoded_bytes(scene) if fits(scene) else 0)
+    sizes = [view.camera.width * view.camera.height for view in scene.views]
+    fixed = PROGRAM_BYTES + max(sizes) * (ITERATION_BYTES * backend.on_host + DECODING_BYTES * downscale**2)
+    fixed += FUSION_BYTES + min(3 * sum(sizes), *(view.cache.max_bytes for view in scene.views))
     if allowed is not None and fixed + splats.most * SPLAT_BYTES > allowed:
         budget = int((allowed - fixed) / SPLAT_BYTES)
         if budget < start:

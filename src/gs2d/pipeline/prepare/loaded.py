@@ -26,7 +26,6 @@ from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
 from gs2d.pipeline.prepare.options import TrainOptions, values
-from gs2d.pipeline.prepare.photographs import already_prepared, with_prepared
 from gs2d.pipeline.prepare.resolve import check_execution, check_options, resolve, schedule_scale_of
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
@@ -132,7 +131,7 @@ class RenderedScene(typing.Protocol):
 def prepare_run(
     options: TrainOptions, on_event: OnEvent, *, title: str = "", part: TrainedPart | None = None
 ) -> LoadedRun:
-    """Check the options, read the capture and resolve the run. Writes only prepared photographs.
+    """Check the options, read the capture and resolve the run. Writes nothing.
 
     Parameters
     ----------
@@ -150,11 +149,7 @@ def prepare_run(
         options = replace(options, protocol=part.protocol, test_every=None)
     init, init_digest = (None, None) if options.init is None else read_init(options.init, on_event)
     capture = open_capture(options, on_event)
-    scene, home = capture.scene, options.out
-    if part is not None:
-        scene, home = part.scene_of(scene), part.prepared or options.out
-    execution = Execution(**values(Execution, options))
-    scene = with_prepared(scene, home, execution, on_event, shared=home != options.out)
+    scene = capture.scene if part is None else part.scene_of(capture.scene)
     missing = missing_lines(options.scene)
     for line in missing[:SHOWN_SKIPS]:
         on_event(Notice(line))
@@ -180,7 +175,7 @@ def prepare_run(
         title=title,
         init=init_digest,
         part=None if start is None else start.digest,
-        execution=execution,
+        execution=Execution(**values(Execution, options)),
     )
     return LoadedRun(resolved, capture.scene, capture.backend, init, start)
 
@@ -258,7 +253,7 @@ def reload_run(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> L
             f"{record.path} has {len(scene.train)} training and {len(scene.test)} test views, the run was made with "
             f"{record.train} and {record.test}; restore the capture or train again"
         )
-    scene = with_refined_poses(run, resolved.recipe, already_prepared(scene, run.path))
+    scene = with_refined_poses(run, resolved.recipe, scene)
     scene = with_learned_appearance(run, resolved.recipe, scene)
     chosen = get_backend(resolved.backend["name"] if backend == "auto" else backend)
     return LoadedRun(resolved, scene, chosen)

@@ -81,13 +81,10 @@ class HowItRuns:
 
 @dataclass(frozen=True, kw_only=True)
 class Resources:
-    """Memory limit, and where photographs are kept."""
+    """Limits of this machine."""
 
     memory: Annotated[float | None, Arg(metavar="GIB")] = None
     """Memory limit in GiB (default: half of the memory of this machine or container)."""
-    prepare: Annotated[Literal["auto", "always", "never"], SETTING] = "auto"
-    """Keep undistorted, shrunk photographs on disk instead of in memory, with the same result. auto: if they do not fit
-    into memory."""
 
 
 @dataclass(frozen=True, kw_only=True)

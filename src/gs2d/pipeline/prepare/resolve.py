@@ -26,7 +26,6 @@ from gs2d.errors import ProtocolError, RecipeError
 from gs2d.losses.base import losses_of
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points
 from gs2d.pipeline.prepare.options import Training, TrainOptions
-from gs2d.pipeline.prepare.photographs import PREPARE
 from gs2d.pipeline.prepare.quality import check_quality
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.point_gains import point_gains
@@ -118,8 +117,6 @@ def check_execution(options: TrainOptions) -> None:
     checkpoint_interval(options.checkpoint_every)
     if options.stage2_cache_mb < 0:
         raise RecipeError(f"stage2_cache_mb must be a whole number >= 0, got {options.stage2_cache_mb}")
-    if options.prepare not in PREPARE:
-        raise RecipeError(f"prepare must be one of {', '.join(PREPARE)}, got {options.prepare}")
     check_subject_box(options.subject_box, {"--scene": options.whole_scene})
 
 

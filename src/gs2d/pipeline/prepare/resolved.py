@@ -74,7 +74,6 @@ class Execution:
 
     threads: int | None = None
     memory: float | None = None
-    prepare: str = "auto"
     checkpoint_every: str = "2m"
     cache: Path | None = None
     page: bool = True

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from torch import Tensor
 
@@ -54,8 +53,6 @@ class TrainedPart:
         None: initialised from points.
     extent : float or None
         World units; None: that of the capture.
-    prepared : Path or None
-        Folder of prepared photographs that several parts share; None: the run folder.
     """
 
     recipe: Recipe
@@ -63,7 +60,6 @@ class TrainedPart:
     views: tuple[str, ...] = ()
     start: PartStart | None = None
     extent: float | None = None
-    prepared: Path | None = None
 
     def scene_of(self, scene: Scene) -> Scene:
         """Return the scene with the views and the extent of the part."""

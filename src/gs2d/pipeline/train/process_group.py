@@ -100,9 +100,7 @@ def lead(loaded: LoadedRun, together: OneProcess, on_event: OnEvent) -> LoadedRu
     rates = loaded.recipe.stages[0].lr
     rate = rates.for_views(together.size).sh0 / rates.sh0
     on_event(Notice(f"{together.size} processes: {together.size} views per iteration, learning rates times {rate:.3g}"))
-    prepare = "always" if loaded.scene.ahead else "never"
-    path = str(loaded.resolved.scene.path)
-    together.tell({"scene": path, "prepare": prepare, "facts": _shared_facts(loaded)})
+    together.tell({"scene": str(loaded.resolved.scene.path), "facts": _shared_facts(loaded)})
     return replace(loaded, processes=together.size)
 
 
@@ -117,7 +115,7 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
         If process 0 has ended.
     """
     sent: dict[str, Any] = together.tell({})
-    loaded = prepare_run(replace(options, scene=Path(sent["scene"]), prepare=sent["prepare"]), ignore)
+    loaded = prepare_run(replace(options, scene=Path(sent["scene"])), ignore)
     for name, value in _shared_facts(loaded).items():
         if sent["facts"][name] != value:
             raise RunError(

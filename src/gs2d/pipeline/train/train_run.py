@@ -35,7 +35,6 @@ from gs2d.pipeline.prepare.estimate import estimate
 from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
-from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.run_parts import TRAINED
@@ -101,7 +100,6 @@ def _train(
 ) -> RunFolder:
     """Train in this process, which leads the others if there are any."""
     check_viewer(options)
-    allowed = (*allowed, PREPARED)
     check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     use_threads(options.threads, together.place.local_size)
     use_memory(memory_of(together.place, options.memory))
