@@ -74,7 +74,7 @@ INSIDE = {
         "finish": 4,
         "look": 3,
         "prepare": 2,
-        "attempts run_parts": 1,
+        "attempts": 1,
     },
     "render": {
         "tensor_api": 7,

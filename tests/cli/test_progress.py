@@ -1,4 +1,4 @@
-"""What is drawn while a command works: bars of any width, sparse lines in a log, the time left of the whole run."""
+"""What is drawn while a command works: bars of any width, sparse lines in a log, the time left."""
 
 from __future__ import annotations
 
@@ -11,19 +11,15 @@ import pytest
 
 from gs2d.cli.bar import Bar
 from gs2d.cli.console import Console
-from gs2d.cli.whole import WholeRun
-from gs2d.pipeline.run_parts import TRAINED
-from gs2d.training.events import Notice, Phase, RunPlan, Step
+from gs2d.training.events import Notice, Phase, Step
 from terminal import ESCAPES, raw_screen_of
 
 DRAWN = textwrap.dedent(
     """
     import time
     from gs2d.cli.console import Console
-    from gs2d.pipeline.run_parts import TRAINED
-    from gs2d.training.events import Notice, Phase, RunPlan, Step
+    from gs2d.training.events import Notice, Phase, Step
     console = Console(quiet=False, as_json=False)
-    console.on_event(RunPlan(TRAINED))
     console.on_event(Phase("training 2dgs-r", 6000))
     for done in (1000, 2000, 3000):
         time.sleep(0.3)
@@ -59,7 +55,6 @@ def test_bars_notes_and_tables_fit_the_terminal(columns: int, module: str) -> No
     lines = [line for part in ESCAPES.sub("", raw).split("\n") for line in part.split("\r")]
     assert max(map(len, lines)) <= columns
     assert any(line.startswith("training 2dgs-r  ") and "3,000/6,000  " in line and "left" in line for line in lines)
-    assert any(line.startswith("part 1 of 3: training; whole run: about ") for line in lines)
     assert any(line.startswith("note a note that is") for line in lines)
     assert any("22.36" in line for line in lines)
 
@@ -94,7 +89,7 @@ def test_a_log_file_gets_one_line_per_phase_and_occasional_progress(
 def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
     quiet, as_json = Console(quiet=True, as_json=True), Console(quiet=False, as_json=True)
     for console in (quiet, as_json):
-        for event in (RunPlan(TRAINED), Phase("training", 3), Step(1), Notice("n")):
+        for event in (Phase("training", 3), Step(1), Notice("n")):
             console.on_event(event)
         console.table("", ["a"], [["b"]])
         console.say("text")
@@ -105,7 +100,7 @@ def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str
 
 
 # Seconds after which 10, 20, ... of 900 iterations were done: a draft of the fountain on a machine with other work,
-# where each fifth line or so comes 7 s late. Then scores, mesh (95 s), page and report (7 s each).
+# where each fifth line or so comes 7 s late.
 RECORDED = """
     1.9 9.7 11.8 13.8 21.6 23.3 24.4 25.8 33 34.2 35.4 36.8 43.9 45.2 47 48.6 56 59.5 67.9 70.2 78.6 80.4 82.2
     90.4 93.2 101.4 104.5 113.2 116.3 124 125.2 126.5 134 135.3 136.6 145.2 146.3 147.5 148.8 150.1 157.4
@@ -113,47 +108,32 @@ RECORDED = """
     216.7 223.9 226.1 227.5 229 236.6 247.5 249.2 251.2 259.1 261 262.8 272.4 280.4 282.7 285.2 292.9 294.4
     296.3 303.9 305.7 307.7 315.4 317 318.2 319.1 326.1 327.4 328.4 329.3 338.9
 """.split()
-RECORDED_LATER = (
-    ("scoring train views", 340.5),
-    ("fusing", 360.2),
-    ("writing the page", 455.4),
-    ("writing the report", 462.5),
-)
 
 
-def follow(seconds: list[float]) -> Iterator[tuple[float, str, float | None]]:
-    """Play a training, and yield seconds, the time left of its bar, and that of the whole run."""
+def follow(seconds: list[float]) -> Iterator[str]:
+    """Play a training, and yield the time left of its bar."""
     clock = Clock()
-    whole = WholeRun(clock)
-    whole.on_plan(RunPlan(TRAINED))
-    phase = Phase("training best", 10 * len(seconds), growth=1.1)
-    whole.on_phase(phase)
-    bar = Bar(phase, whole, clock)
+    bar = Bar(Phase("training best", 10 * len(seconds)), clock)
     for number, now in enumerate(seconds, start=1):
         clock.now = now
         bar.step(10 * number)
-        whole.on_step(10 * number)
-        yield now, bar.left(), whole.left()
-    for name, now in RECORDED_LATER:
-        clock.now = now
-        whole.on_phase(Phase(name, 0))
-        yield now, "", whole.left()
+        yield bar.left()
+
+
+def seconds_of(left: str) -> float:
+    number, unit = left.removesuffix(" left").split()
+    return float(number) * {"s": 1, "min": 60}[unit]
 
 
 def test_the_time_left_of_a_recorded_run_never_rises() -> None:
-    shown, bounds = [], []
-    for _, left, whole in follow([float(seconds) for seconds in RECORDED]):
-        shown += [left.removesuffix(" left")] if left.endswith(" left") else []
-        bounds += [whole] if whole is not None else []
-    seconds = [float(number) * {"s": 1, "min": 60}[unit] for number, unit in map(str.split, shown)]
+    shown = [seconds_of(left) for left in follow([float(seconds) for seconds in RECORDED]) if left.endswith(" left")]
     assert len(shown) > 80
-    for values in (seconds, bounds):
-        assert values == sorted(values, reverse=True)
-        assert values[-1] < values[0] / 4
-    assert 200 < seconds[5] < 600  # 317 s were left
+    assert shown == sorted(shown, reverse=True)
+    assert shown[-1] < shown[0] / 4
+    assert 200 < shown[5] < 600  # 317 s were left
 
 
 def test_the_time_left_rises_where_the_work_grows() -> None:
     grown = [float(i) for i in range(1, 31)] + [30.0 + 20.0 * i for i in range(1, 61)]  # twenty times as slow
-    lefts = [whole for _, left, whole in follow(grown) if left and whole is not None]
+    lefts = [seconds_of(left) for left in follow(grown) if left.endswith(" left")]
     assert max(lefts[40:60]) > 2 * min(lefts[20:30])

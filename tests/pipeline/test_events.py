@@ -7,11 +7,11 @@ import pytest
 from gs2d.training.events import Phase
 
 
-def test_the_time_left_accounts_for_growing_steps() -> None:
-    """A quarter of equal steps in 10 s: 30 s are left. Of steps that grow, it was a sixteenth: 150 s are left."""
+def test_the_time_left_follows_from_the_steps_since_the_beginning_or_a_resume() -> None:
     assert Phase("matching pairs", 40).seconds_left(10, 10.0) == pytest.approx(30.0)
-    assert Phase("placing cameras", 40, growth=2.0).seconds_left(10, 10.0) == pytest.approx(150.0)
-    assert Phase("placing cameras", 40, growth=2.0).seconds_left(40, 99.0) == 0.0
+    assert Phase("training", 40, done=20).seconds_left(30, 10.0) == pytest.approx(10.0)
+    assert Phase("matching pairs", 40).seconds_left(40, 99.0) == 0.0
+    assert Phase("matching pairs", 40).seconds_left(1, 1.0) is None  # too early
 
 
 def test_the_time_left_is_unknown_without_a_number_of_steps() -> None:

@@ -2,37 +2,46 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from gs2d.cli.whole import Countdown, WholeRun
 from gs2d.core.text import duration, printable
 from gs2d.training.events import Phase
 
+GREW = (2.0, 60.0)  # factor and seconds by which an estimate must exceed the shown time for the work to have grown
 _WIDEST, _LEAST = 32, 6  # columns of a bar; no bar with fewer
 _FULL, _EMPTY = "\u2501", "\u2500"
 
 
 class Bar:
-    """Progress of a phase: name, bar, counts and time left; below it details and the whole run."""
+    """Progress of a phase: name, bar, counts and time left; below it details."""
 
-    def __init__(self, phase: Phase, whole: WholeRun, clock: Callable[[], float] = time.monotonic) -> None:
-        self.phase, self._whole, self._clock = phase, whole, clock
+    def __init__(self, phase: Phase, clock: Callable[[], float] = time.monotonic) -> None:
+        self.phase, self._clock = phase, clock
         self.done, self.detail = phase.done, ""
-        self._began, self._shown = clock(), Countdown()
+        self._began, self._shown = clock(), math.inf  # time at the beginning, and shown time left, s
 
     def step(self, done: int, detail: str = "") -> None:
         """Count a step."""
         self.done, self.detail = done, detail
 
     def left(self) -> str:
-        """Return the time left ("3 min left"), or the elapsed time where it is too early to estimate."""
+        """Return the time left ("3 min left"), or the elapsed time where it is too early to estimate.
+
+        The time left increases only if the work grew.
+        """
         elapsed = self._clock() - self._began
         seconds = self.phase.seconds_left(self.done, elapsed)
-        return duration(elapsed) if seconds is None else f"{duration(self._shown.show(seconds))} left"
+        if seconds is None:
+            return duration(elapsed)
+        if seconds <= GREW[0] * self._shown + GREW[1]:
+            seconds = min(seconds, self._shown)
+        self._shown = seconds
+        return f"{duration(seconds)} left"
 
     def lines(self, width: int, *, ascii_only: bool = False) -> Iterator[Text]:
         """Yield the lines, at most ``width`` columns wide."""
@@ -48,8 +57,6 @@ class Bar:
         yield line.append("  " + tail)
         if self.detail:
             yield Text(_cut("  " + self.detail, width), no_wrap=True)
-        if whole := self._whole.line():
-            yield Text(_cut(whole, width), no_wrap=True, style="dim")
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield from self.lines(options.max_width - 1, ascii_only=options.ascii_only)

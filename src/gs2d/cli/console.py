@@ -17,9 +17,8 @@ from rich.table import Table
 
 from gs2d.cli.bar import Bar
 from gs2d.cli.layout import records, wrapped
-from gs2d.cli.whole import WholeRun
 from gs2d.core.text import printable
-from gs2d.training.events import Event, Notice, NotMade, Phase, RunPlan, StageScored, Step
+from gs2d.training.events import Event, Notice, NotMade, Phase, StageScored, Step
 
 LOG_SECONDS, LOG_FRACTION = (
     60.0,
@@ -75,7 +74,6 @@ class Console:
         self._out = _screen(sys.stdout, soft_wrap=True)
         self._err = _screen(sys.stderr)
         self._interactive = _has_cursor(sys.stderr)
-        self._whole = WholeRun()
         self._live: Live | None = None
         self._bar: Bar | None = None
         self._named: set[str] = set()  # phases with a line in the log file
@@ -90,13 +88,9 @@ class Console:
             self.missing.append(event)
         if self.quiet:
             return
-        if isinstance(event, RunPlan):
-            self._whole.on_plan(event)
-        elif isinstance(event, Phase):
-            self._whole.on_phase(event)
+        if isinstance(event, Phase):
             self._begin(event)
         elif isinstance(event, Step):
-            self._whole.on_step(event.done)
             self._step(event)
         elif isinstance(event, Notice):
             if self._verbose or not event.detail:
@@ -123,7 +117,7 @@ class Console:
                 self._err.print(line, markup=False, soft_wrap=True)
 
     def _begin(self, phase: Phase) -> None:
-        self._bar = Bar(phase, self._whole)
+        self._bar = Bar(phase)
         if not self._interactive:  # a log file: one line per phase, then occasional progress
             if phase.name not in self._named:
                 name = printable(phase.name)
@@ -145,11 +139,8 @@ class Console:
         due = LOG_FRACTION * total <= step.done - done or not self._logs or silence >= LOG_SILENCE
         if not self._interactive and total and silence >= LOG_SECONDS and due:
             self._logged, self._logs = (time.monotonic(), step.done), self._logs + 1
-            words = [
-                f"{printable(self._bar.phase.name)}: {step.done:,} of {total:,}, {self._bar.left()}",
-                self._whole.line(),
-            ]
-            self._err.print("; ".join(filter(None, words)), markup=False, soft_wrap=True)
+            line = f"{printable(self._bar.phase.name)}: {step.done:,} of {total:,}, {self._bar.left()}"
+            self._err.print(line, markup=False, soft_wrap=True)
 
     def close(self) -> None:
         """Remove the progress bar."""

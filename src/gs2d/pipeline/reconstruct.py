@@ -32,13 +32,12 @@ from gs2d.pipeline.prepare.options import (
 )
 from gs2d.pipeline.prepare.pose_finding import check_poses_options, find_poses, placed_line, requested_options
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.run_parts import PLACED, TEXTURED_TOO, TRAINED
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.sfm.colmap_process import check_installed
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.video_frames import is_video, look_into
 from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_workspace
-from gs2d.training.events import Notice, OnEvent, RunPlan, ignore
+from gs2d.training.events import Notice, OnEvent, ignore
 
 CAPTURE = "capture"
 GENERIC_NAMES = ("images", "photos", "photographs", "pictures")  # of folders: the report is named by the parent
@@ -74,7 +73,6 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
     training fails: ``resume`` then does not estimate the cameras again.
     """
     check_reconstruct(options)
-    on_event(RunPlan((*PLACED, *(TEXTURED_TOO if options.texture else TRAINED))))
     find_cameras(options, on_event)
     return train_found(options, on_event)
 

@@ -174,32 +174,20 @@ class Phase:
     total : int
     done : int
         Steps that an interrupted run had done.
-    growth : float
-        For steps of increasing cost: the first fraction s of the steps takes the fraction s ** growth of the time.
     """
 
     name: str
     total: int
     done: int = 0
-    growth: float = 1.0
 
     def seconds_left(self, done: int, elapsed: float) -> float | None:
         """Return the seconds until the phase ends, after ``elapsed`` seconds; None: too early to estimate."""
-        total = self.seconds_in_all(done, elapsed)
-        return None if total is None else total * (1.0 - self._time_share(min(done, self.total)))
-
-    def seconds_in_all(self, done: int, elapsed: float) -> float | None:
-        """Return the seconds of the whole phase, including steps before a resume; None: too early to estimate."""
-        if not self.total or done <= self.done:
+        steps, rest = done - self.done, max(self.total - done, 0)
+        if not self.total or steps <= 0:
             return None
-        begun, now = (self._time_share(steps) for steps in (self.done, min(done, self.total)))
-        if now - begun < MIN_SHARE * (1.0 - begun) and elapsed < MIN_SECONDS:
+        if steps < MIN_SHARE * (steps + rest) and elapsed < MIN_SECONDS:
             return None
-        return elapsed / (now - begun)
-
-    def _time_share(self, steps: int) -> float:
-        """Return the fraction of the time of the phase that its first ``steps`` take."""
-        return float((steps / self.total) ** self.growth)
+        return elapsed * rest / steps
 
 
 @dataclass(frozen=True)
@@ -268,31 +256,6 @@ class NotMade:
     error: Exception | None = None
 
 
-@dataclass(frozen=True)
-class RunPart:
-    """A part of a run, of one or more phases.
-
-    Attributes
-    ----------
-    name : str
-    begins : tuple of str
-        Prefixes of the names of its phases. Any other phase belongs to the part in which it occurs.
-    of_training : float or None
-        Expected time as a fraction of the training time; None: unknown.
-    """
-
-    name: str
-    begins: tuple[str, ...]
-    of_training: float | None = None
-
-
-@dataclass(frozen=True)
-class RunPlan:
-    """The parts of a run, in order. A plan that is a subset of the previous plan is ignored."""
-
-    parts: tuple[RunPart, ...]
-
-
 TrainingEvent = (
     Initialised
     | StageEntering
@@ -305,7 +268,7 @@ TrainingEvent = (
     | FloatersRemoved
     | StageFinished
 )
-Event = TrainingEvent | Phase | Step | Notice | StageScored | NotMade | RunPlan
+Event = TrainingEvent | Phase | Step | Notice | StageScored | NotMade
 OnEvent = Callable[[Event], None]
 
 

@@ -13,19 +13,13 @@ from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.options import EvaluateOptions, HowItRuns, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.train_run import check_viewer, train
-from gs2d.training.events import OnEvent, Phase, RunPart, RunPlan, Step, ignore
+from gs2d.training.events import OnEvent, Phase, Step, ignore
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json")  # and mesh_gt*
 TITLE = "gs2d demo: a still life with a known surface"
 SCHEDULE_SCALE = 0.15
-PARTS = (
-    RunPart("photographs", ("photographing",)),
-    *TRAINED,
-    RunPart("scores", ("scoring the surface",), of_training=0.1),
-)
 
 
 def demo(
@@ -47,7 +41,6 @@ def demo(
     check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=(CAPTURE,))
     check_viewer(training)
     use_threads(options.threads)
-    on_event(RunPlan(PARTS))
     if not (options.resume and (capture / "transforms_train.json").exists()):
         _check_capture(capture)
         on_event(Phase("photographing the demo scene", options.train_views + options.test_views))

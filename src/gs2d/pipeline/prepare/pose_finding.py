@@ -25,7 +25,6 @@ from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.photo_positions import metric_positions
-from gs2d.pipeline.run_parts import PLACED
 from gs2d.sfm.as_fisheye import FISHEYE
 from gs2d.sfm.colmap_process import Group, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.image_copies import copy_images
@@ -56,7 +55,7 @@ from gs2d.sfm.workspace import (
     sweep_workspace,
     workspace,
 )
-from gs2d.training.events import Notice, OnEvent, Phase, RunPlan, Step, counted, ignore
+from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", PANORAMA)
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
@@ -86,7 +85,6 @@ LIMITS = {
     "seed": (0, (1 << 31) - 1),
 }
 FRAMES = "frames"  # folder of the frames of a video, in the workspace
-_GROWTH = {"placing cameras": 1.5}  # each camera is adjusted with a growing number of others
 _SHOWN_MODELS = 5
 _FEW_PLACED, _LARGE_ERROR, _SMALL_ANGLE = 0.8, 1.5, 4.0  # fraction of photographs; px; degrees
 
@@ -101,7 +99,6 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     DataError, RunError, DiskError
     """
     started = time.monotonic()
-    on_event(RunPlan(PLACED))
     check_installed()
     check_poses_options(options)
     video = look_into(options.photos) if is_video(options.photos) else None
@@ -333,7 +330,7 @@ def _progress(on_event: OnEvent) -> Callable[[str, int, int], None]:
 
     def listen(name: str, done: int, total: int) -> None:
         nonlocal current
-        on_event(Step(done) if name == current else Phase(name, total, growth=_GROWTH.get(name, 1.0)))
+        on_event(Step(done) if name == current else Phase(name, total))
         current = name
 
     return listen

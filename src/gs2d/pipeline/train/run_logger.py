@@ -27,7 +27,6 @@ from gs2d.training.trainer import Trainer
 
 LOG_LINES = 300  # progress lines per stage
 PROBES = 30  # times per stage at which the probe views are scored for the PSNR curve
-GROWTH = 1.1  # of the cost of iterations, while splats are added (``Phase.growth``)
 REPORT_EVERY, REPORT_EVERY_ON_GPU = 10, 50  # iterations between progress events, for which the host waits for a GPU
 
 
@@ -232,7 +231,7 @@ class RunLogger:
     def _phase(self) -> None:
         state, recipe = self._state, self._loaded.recipe
         done = self._iterations_before(state.stage) + state.step
-        self._on_event(Phase(f"training {recipe.name}", recipe.iterations, done, growth=GROWTH))
+        self._on_event(Phase(f"training {recipe.name}", recipe.iterations, done))
 
 
 def progress_every(loaded: LoadedRun) -> int:

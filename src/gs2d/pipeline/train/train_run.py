@@ -37,12 +37,11 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.prepare.scene_part import TrainedPart
-from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
 from gs2d.pipeline.train.resume import ResumePoint, choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
-from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, RunPlan, TrainingEvent, ignore
+from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, TrainingEvent, ignore
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.page_server import free_port
 
@@ -103,7 +102,6 @@ def _train(
     check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     use_threads(options.threads, together.place.local_size)
     use_memory(memory_of(together.place, options.memory))
-    on_event(RunPlan(TRAINED))
     details: list[str] = []
     on_event = keeping_details(on_event, details)
     loaded = prepare_run(options, on_event, title=title, part=part)
