@@ -21,7 +21,6 @@ FOUND: dict[str, Any] = {
     "photos_per_point": 4.25,
     "mean_error_px": 0.82,
     "cameras": [{"about": "SIMPLE_RADIAL of 2 photographs, 1000x1000, f = 1317 px (42 degrees wide)"}],
-    "lens": {"about": "lens: SIMPLE_RADIAL 1.393 px on observations held out; SIMPLE_PINHOLE 1.429"},
     "photographs": [
         {"source": "a.jpg", "placed": True, "features": 4000},
         {"source": "b.jpg", "placed": True, "features": 4000},
@@ -37,13 +36,12 @@ def capture(folder: Path, found: dict[str, Any]) -> Path:
     return folder
 
 
-def test_the_report_has_unplaced_photographs_lens_and_image(tmp_path: Path) -> None:
+def test_the_report_has_unplaced_photographs_cameras_and_image(tmp_path: Path) -> None:
     capture(tmp_path / "capture", FOUND)
     html = str(capture_section(RunRecord(tmp_path, {})))
     assert "2 of 3 photographs have a camera. There are 1,234 sparse points" in html
     assert "&lt;c&gt;.jpg" in html
     assert "21 matches with a.jpg at best" in html
-    assert "Lens: SIMPLE_RADIAL 1.393 px on observations held out" in html
     assert "f = 1317 px" in html
     assert "data:image/jpeg;base64," in html
 

@@ -1,4 +1,4 @@
-"""Structure from motion: photographs with a camera, the lens, photographs without a camera."""
+"""Structure from motion: photographs with a camera, their lenses, photographs without a camera."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ def capture_section(run: RunRecord) -> str | None:
         found = read_json(folder / POSES_JSON)
         rows = [row for row in found["photographs"] if not row["placed"]]
         lost = [(row["source"], f"{int(row['features']):,}", row["reason"]) for row in rows]
-        lens = str((found.get("lens") or {}).get("about", ""))
-        return render("capture.html", found=found, lens=lens, lost=lost, pixels=pixels, unreadable=unreadable)
+        return render("capture.html", found=found, lost=lost, pixels=pixels, unreadable=unreadable)
 
 
 def _image(path: Path) -> tuple[np.ndarray | None, str]:
