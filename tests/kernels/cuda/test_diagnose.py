@@ -46,12 +46,6 @@ MENDING = (
 )
 
 
-@pytest.fixture(autouse=True)
-def nothing_brought(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide cubins that scripts/build_cubins.py may have left in this checkout."""
-    monkeypatch.setattr(nvrtc, "shipped_kernels", lambda: None)
-
-
 def test_each_missing_piece_is_named_in_order_with_its_remedy() -> None:
     facts = BROKEN
     for change, reason, remedy in MENDING:

@@ -1,9 +1,9 @@
 """Compile the CUDA kernels with NVRTC and cache the cubins.
 
 This needs neither the CUDA toolkit nor a host compiler: NVRTC comes as a wheel, with torch or by itself. It is imported
-only for kernels that are neither shipped (:mod:`gs2d.kernels.cuda.shipped`) nor cached. The cache key covers the
-package version, sources, options and architecture, so a changed package never loads a stale cubin. Cubins are written
-to a temporary name and renamed, so no process sees a partial file, and carry a digest, so damaged ones are recompiled.
+only for kernels that are not cached. The cache key covers the package version, sources, options and architecture, so a
+changed package never loads a stale cubin. Cubins are written to a temporary name and renamed, so no process sees a
+partial file, and carry a digest, so damaged ones are recompiled.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ from typing import Any
 import gs2d
 from gs2d.core.atomic_files import atomic_write
 from gs2d.errors import BackendError, DiskError
-from gs2d.kernels.cuda.shipped import INTEGRATED, SHIPPED, Shipped, digest_of
-from gs2d.kernels.cuda.shipped import shipped as _shipped
 
 __all__ = [
     "ARCHITECTURES",
@@ -35,12 +33,14 @@ __all__ = [
     "is_writable",
     "kernel_sources",
     "nvrtc_version",
-    "shipped_kernels",
     "source_names",
     "sources",
 ]
 
-ARCHITECTURES = SHIPPED
+ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+# GPUs integrated with a CPU (Xavier, Orin, Thor): their code and that of other GPUs of the same major version are not
+# compatible.
+INTEGRATED = frozenset({72, 87, 88, 101, 110})
 # --fmad=false: core/ writes out every fused multiply-add, so that forward, backward and CPU take the same branches.
 OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v", "--device-as-default-execution-space")
 REMEDY = "pip install nvidia-cuda-nvrtc cuda-bindings (torch's CUDA wheels bring both), or use --backend cpu"
@@ -119,11 +119,6 @@ def kernel_sources() -> dict[str, str]:
     return {kernel: name for name, text in sources().items() if name.endswith(".cu") for kernel in KERNEL.findall(text)}
 
 
-def shipped_kernels() -> Shipped | None:
-    """Return the shipped machine code; None without any, or if sources were edited."""
-    return _shipped(gs2d.__version__, digest_of(sources(), OPTIONS))
-
-
 def _nvrtc() -> Any:
     try:
         from cuda.bindings import nvrtc
@@ -150,10 +145,9 @@ def nvrtc_version() -> tuple[int, int]:
 def architecture_for(capability: tuple[int, int]) -> str:
     """Return the architecture to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
 
-    A shipped architecture comes first, since it needs no compiler. A device newer than the compiler runs code for an
-    older one of the same major version. For a newer major version the result is PTX of the newest known architecture,
-    such as ``"compute_120"``, which the driver translates. Without a compiler it is an architecture that the cache may
-    hold.
+    A device newer than the compiler runs code for an older one of the same major version. For a newer major version the
+    result is PTX of the newest known architecture, such as ``"compute_120"``, which the driver translates. Without a
+    compiler it is an architecture that the cache may hold.
 
     Raises
     ------
@@ -165,10 +159,6 @@ def architecture_for(capability: tuple[int, int]) -> str:
             f"the GPU must have compute capability 7.5 or more (Turing, 2018), got {capability[0]}.{capability[1]}; "
             "use --backend cpu"
         )
-    there = shipped_kernels()
-    brought = None if there is None else there.architecture_for(capability)
-    if brought is not None:
-        return brought
     known = _known_architectures()
     wanted = 10 * capability[0] + capability[1]
     older = [arch for arch in known if arch <= wanted and (arch == wanted or arch not in INTEGRATED)]
@@ -184,7 +174,7 @@ def architecture_for(capability: tuple[int, int]) -> str:
 
 
 def _known_architectures() -> list[int]:
-    """Return the architectures that the compiler knows; without a compiler, the shipped ones."""
+    """Return the architectures that the compiler knows; without a compiler, ``ARCHITECTURES``."""
     try:
         nvrtc = _nvrtc()
     except BackendError:
@@ -292,11 +282,16 @@ def is_writable(folder: Path | None) -> bool:
 
 def _key(name: str, arch: str) -> str:
     """Return the cache key: all that the machine code depends on except the compiler's version."""
-    return digest_of(sources(), (gs2d.__version__, name, arch, *OPTIONS))[:32]
+    digest = hashlib.sha256()
+    texts = (text for pair in sorted(sources().items()) for text in pair)
+    for part in (gs2d.__version__, name, arch, *OPTIONS, *texts):
+        data = part.encode()
+        digest.update(len(data).to_bytes(8, "little") + data)
+    return digest.hexdigest()[:32]
 
 
 def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
-    """Return the machine code of one file for one architecture: shipped, cached, or compiled.
+    """Return the machine code of one file for one architecture: cached, or compiled.
 
     A cache that cannot be read or written only costs compile time.
 
@@ -313,10 +308,6 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
         As for :func:`compile_source`.
     """
     stem = name.rpartition("/")[2].removesuffix(".cu")
-    there = shipped_kernels()
-    brought = None if there is None else there.code(name, arch)
-    if brought is not None:
-        return Cubin(brought, "")
     folder = folder or cache_folder()
     path = None if folder is None else folder / f"{stem}-{arch}-{_key(name, arch)}.cubin"
     code = None if path is None else _read(path)

@@ -53,8 +53,6 @@ class Facts:
     cache_writable : bool
     own_default_stream : bool
         Whether cuda.bindings uses a default stream of its own instead of torch's.
-    shipped : (int, int) or None
-        CUDA version of the shipped machine code for the current device; None: there is none.
     """
 
     torch_version: str
@@ -70,7 +68,6 @@ class Facts:
     cache: Path | None = Path()
     cache_writable: bool = True
     own_default_stream: bool = False
-    shipped: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -97,12 +94,11 @@ def missing(facts: Facts) -> Obstacle | None:
         return Obstacle(
             f"the Python package cuda.bindings is missing ({facts.bindings_error})", _install(facts.torch_cuda[0])
         )
-    if facts.nvrtc_error and facts.shipped is None:
+    if facts.nvrtc_error:
         return Obstacle(f"the CUDA compiler NVRTC is missing ({facts.nvrtc_error})", _install(facts.torch_cuda[0]))
     if facts.driver_error or facts.driver is None:
         return Obstacle(f"no NVIDIA driver is installed ({facts.driver_error})", DRIVER_REMEDY)
-    compiler = facts.nvrtc if facts.shipped is None else facts.shipped
-    for name, needs in (("torch", facts.torch_cuda), ("NVRTC" if facts.shipped is None else "gs2d", compiler)):
+    for name, needs in (("torch", facts.torch_cuda), ("NVRTC", facts.nvrtc)):
         if needs is not None and facts.driver[0] < needs[0]:  # within a major version newer code runs on older drivers
             return Obstacle(
                 f"the driver supports CUDA {dotted(facts.driver)}, but {name} needs CUDA {dotted(needs)}",
@@ -130,10 +126,7 @@ def _install(major: int) -> str:
 def describe(facts: Facts) -> str:
     """Return a line about a machine that can run the backend."""
     names = [f"{name} (sm_{major}{minor})" for name, (major, minor) in facts.devices]
-    compiler = f"NVRTC {dotted(facts.nvrtc)}"
-    if facts.shipped is not None:
-        return f"{', '.join(names)}; driver CUDA {dotted(facts.driver)}, kernels of the package"
-    versions = f"driver CUDA {dotted(facts.driver)}, {compiler}"
+    versions = f"driver CUDA {dotted(facts.driver)}, NVRTC {dotted(facts.nvrtc)}"
     return f"{', '.join(names)}; {versions}{cache_words(facts.cache, facts.cache_writable)}"
 
 
@@ -173,10 +166,7 @@ def gather() -> Facts:
     except BackendError as error:
         nvrtc_error = inner(error)
     devices, torch_error = seen_devices()
-    shipped = nvrtc.shipped_kernels()
-    if shipped is not None and (not devices or shipped.architecture_for(devices[0][1]) is None):
-        shipped = None
-    if devices and (compiler is not None or shipped is not None):
+    if devices and compiler is not None:
         try:
             nvrtc.architecture_for(devices[0][1])
         except BackendError as error:
@@ -196,7 +186,6 @@ def gather() -> Facts:
         folder,
         nvrtc.is_writable(folder),
         own_default_stream(),
-        None if shipped is None else shipped.compiler,
     )
 
 
