@@ -47,7 +47,7 @@ INSIDE = {
         "checks growth locks extras memory memory_limit missing processes spill text": 0,
         "atomic_files image_arrays similarity": 1,
         "json_files camera mesh sh splats": 2,
-        "residual_lens transforms": 3,
+        "transforms": 3,
     },
     "data": {
         "load subject_box": 11,
@@ -56,7 +56,7 @@ INSIDE = {
         "build": 7,
         "bounds reach": 6,
         "scene": 5,
-        "prior_maps faces straighten masks": 4,
+        "prior_maps faces masks": 4,
         "cache exif file_names undistort": 3,
         "camera_models image_files photo_formats positions": 2,
         "arrays csv_tables float_images": 1,

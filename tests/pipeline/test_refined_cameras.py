@@ -43,7 +43,6 @@ def test_views_have_the_refined_focal_length_and_the_file_can_be_loaded(
     assert zoom is not None
     assert abs(zoom.scale - 1) > 1e-3
     assert (zoom.right, zoom.down) == (0.0, 0.0)
-    assert abs(zoom.k1) > 1e-4
     for view, before in zip(job.scene.views, given.views, strict=True):
         assert view.zoom == zoom
         assert view.camera.fx == pytest.approx(before.camera.fx * zoom.scale)
@@ -54,12 +53,9 @@ def test_views_have_the_refined_focal_length_and_the_file_can_be_loaded(
         (tmp_path / "again" / name).unlink()
     shutil.copy(run.file(POSES), tmp_path / "again" / "transforms.json")
     again = {view.name: view for view in load_scene(tmp_path / "again", format="nerfstudio").views}
-    before_of = {view.name: view for view in given.views}
     for view in job.scene.views:
         assert again[view.name].camera.fx == view.camera.fx
-        pictures = [found.image().astype(int) for found in (before_of[view.name], again[view.name], view)]
-        bent, apart = (np.abs(pictures[1] - other).mean() for other in (pictures[0], pictures[2]))
-        assert apart < bent / 2  # one samples linearly, the other cubically
+        np.testing.assert_array_equal(again[view.name].image(), view.image())
         np.testing.assert_allclose(again[view.name].camera.T_cam_world, view.camera.T_cam_world, atol=1e-9)
 
 

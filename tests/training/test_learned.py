@@ -29,7 +29,7 @@ NAMES = ("intrinsics", "poses", "exposure")
 def everything(**changes: float) -> Recipe:
     """Return ``short`` with all quantities active from the third iteration on."""
     given = {"start": 2, "decay_steps": 10, "rate": 1e-2, "rate_final": 1e-3, **changes}
-    quantities = EXPOSURE, POSES, INTRINSICS.with_options(distortion=True)
+    quantities = EXPOSURE, POSES, INTRINSICS.with_options(principal_point=True)
     return short().with_learned(*(replace(quantity, **given) for quantity in quantities))  # type: ignore[arg-type]
 
 
@@ -151,6 +151,6 @@ def test_a_recipe_names_registered_quantities_once() -> None:
         from_json(to_json(twice))
     learning = recipe.with_learned(EXPOSURE, INTRINSICS, POSES)
     assert list(learning.quantities) == ["intrinsics", "poses", "exposure"]  # in the order of application
-    changed = apply_overrides(learning, ["learned.exposure.start=7", "learned.intrinsics.options.distortion=true"])
+    changed = apply_overrides(learning, ["learned.exposure.start=7", "learned.intrinsics.options.principal_point=true"])
     assert changed.quantities["exposure"] == replace(EXPOSURE, start=7)
     assert changed.quantities["intrinsics"].options == {"distortion": True}

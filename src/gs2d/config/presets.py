@@ -300,13 +300,13 @@ def with_poses(recipe: Recipe) -> Recipe:
 
 
 def with_intrinsics(recipe: Recipe) -> Recipe:
-    """Return the recipe with refined poses, focal lengths and lenses (``NAME-cameras``); itself if it has them.
+    """Return the recipe with refined poses and focal lengths (``NAME-cameras``); itself if it has them.
 
     Not in the paper. For focal lengths with errors of a few per mille to percent (docs/guides/poses.md).
     """
     if recipe.learns("intrinsics"):
         return recipe
-    refined = with_poses(recipe).with_learned(INTRINSICS.with_options(distortion=True))
+    refined = with_poses(recipe).with_learned(INTRINSICS)
     return replace(refined, name=f"{recipe.name.removesuffix('-poses')}-cameras")
 
 

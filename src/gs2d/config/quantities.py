@@ -136,6 +136,5 @@ POSES = Quantity("poses", 5e-4, 5e-6)
 INTRINSICS = Quantity("intrinsics", 1e-4, 1e-6)
 """Focal length of each camera, learned with the poses; the rate is of its logarithm.
 
-Images whose files have the same intrinsics share a camera. Options: ``distortion`` (two radial coefficients of a
-residual lens) and ``principal_point``, both false by default.
+Images whose files have the same intrinsics share a camera. Option: ``principal_point``, false by default.
 """

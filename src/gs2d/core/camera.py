@@ -16,20 +16,12 @@ if TYPE_CHECKING:
 class Zoom(NamedTuple):
     """A change of intrinsics, independent of the image size.
 
-    Focal lengths are multiplied by ``scale``; the principal point moves by ``right`` and ``down`` focal lengths; ``k1``
-    and ``k2`` are residual distortion (``core/residual_lens.py``).
+    Focal lengths are multiplied by ``scale``; the principal point moves by ``right`` and ``down`` focal lengths.
     """
 
     scale: float = 1.0
     right: float = 0.0
     down: float = 0.0
-    k1: float = 0.0
-    k2: float = 0.0
-
-    @property
-    def lens(self) -> tuple[float, float] | None:
-        """k1 and k2; None without residual distortion."""
-        return (self.k1, self.k2) if self.k1 or self.k2 else None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -148,8 +140,8 @@ class Camera:
         return self._with(width, height, (self.fx / f, self.fy / f, self.cx / f, self.cy / f), (1 / f,) * 4)
 
     def zoomed(self, zoom: Zoom) -> Camera:
-        """Return the camera with changed intrinsics, without their tensor; residual distortion is not applied."""
-        scale, right, down, *_ = zoom
+        """Return the camera with changed intrinsics, without their tensor."""
+        scale, right, down = zoom
         cx, cy = self.cx + self.fx * right, self.cy + self.fy * down
         return replace(self, fx=self.fx * scale, fy=self.fy * scale, cx=cx, cy=cy, intrinsics=None)
 

@@ -18,7 +18,6 @@ from gs2d.core.memory import trim
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
 from gs2d.data.prior_maps import UNOBSERVED, ObservedPoints, PriorMaps
-from gs2d.data.straighten import straightened_image
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
@@ -82,18 +81,9 @@ class View:
         return cls(name, camera, lambda: decoded)
 
     def at(self, T_cam_world: np.ndarray, zoom: Zoom | None = None) -> View:
-        """Return the view with another pose; its image stays in the cache of this view.
-
-        ``zoom`` also changes the intrinsics; if it has residual distortion, the image is undistorted on each access.
-        """
+        """Return the view with another pose, and other intrinsics; its image stays in the cache of this view."""
         camera = replace(self.camera, T_cam_world=T_cam_world)
-        if zoom is None:
-            return self._sharing(camera=camera)
-        now, lens = camera.zoomed(zoom), zoom.lens
-        seen = self._sharing(camera=now, zoom=zoom)
-        if lens is None:
-            return seen
-        return replace(seen, decode=lambda: straightened_image(self._image(), now, lens))
+        return self._sharing(camera=camera) if zoom is None else self._sharing(camera=camera.zoomed(zoom), zoom=zoom)
 
     def with_appearance(self, found: Appearance) -> View:
         """Return the view with further appearance parameters."""

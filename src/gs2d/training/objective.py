@@ -152,11 +152,6 @@ class FullRender:
         """Return the current camera of training view ``index``, with gradients for the quantities in ``learning``."""
         return self.learned.camera(state.learned, index, self.scene.train[index].camera, learning)
 
-    def _seen(self, state: TrainState, index: int) -> tuple[Camera, Target]:
-        """Return the current camera of a view, and its image as that camera shows it."""
-        camera = self.camera(state, index)
-        return camera, self.learned.target(state.learned, index, camera, self.targets[index])
-
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
     ) -> StepResult:
@@ -192,7 +187,7 @@ class FullRender:
         self, state: TrainState, index: int, splats: Splats, settings: RasterSettings, *, occlusion: bool
     ) -> Tensor:
         """Return the inner sum of E_i [N] in training view ``index``, in the colours of its image."""
-        camera, target = self._seen(state, index)
+        camera, target = self.camera(state, index), self.targets[index]
         if self.learned.changes_color:
             numbers = self.learned.numbers(state.learned, index, splats.means)
             splats = shown_splats(splats, camera, numbers, settings.sh_degree)
@@ -260,10 +255,7 @@ class FullRender:
         at = self._points(camera, target)
         numbers = self.learned.leaves(state.learned, index, camera, output.color)
         if numbers:
-            color = shown(output.color, numbers, at, clipped_pixels(target))
-            if at.inside is not None:  # pixels outside the rendering have no loss
-                color = torch.where(at.inside[..., None], color, target.image)
-            output = replace(output, color=color)
+            output = replace(output, color=shown(output.color, numbers, at, clipped_pixels(target)))
         view = LossView(
             target.image,
             camera,

@@ -27,8 +27,7 @@ ABOUT = (
     "refined cameras of the training photographs and original cameras of the test photographs, in the layout of "
     "nerfstudio's transforms.json (OpenGL camera to world), for undistorted images of size w x h; T_cam_world: the "
     "same for OpenCV, world to camera; moved: from the original pose, shift as a fraction of the extent; zoom: factor "
-    "of the original focal lengths, shift of the principal point to the right and down (focal lengths), then k1 and "
-    "k2 of the residual lens, as in docs/math.md; the frame's own k1 and k2 are its inverse"
+    "of the original focal lengths, then shift of the principal point to the right and down (focal lengths)"
 )
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GRID = 5  # points along each side of an image, by which motion is measured
@@ -61,14 +60,12 @@ def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent)
 
 
 def zoom_line(zooms: Sequence[Zoom]) -> str:
-    """Describe the refinement of focal lengths and lenses of training views in one line."""
+    """Describe the refinement of focal lengths of training views in one line."""
     scales = sorted({zoom.scale for zoom in zooms})
     factor = f"{scales[0]:.4f}" if len(scales) == 1 else f"{scales[0]:.4f} to {scales[-1]:.4f} ({len(scales)} cameras)"
     moved = max(max(abs(zoom.right), abs(zoom.down)) for zoom in zooms)
     also = f", principal points moved by up to {moved:.4f} focal lengths" if moved else ""
-    bends = max((zoom.lens for zoom in zooms if zoom.lens), default=None, key=lambda lens: abs(lens[0]))
-    residual = "" if bends is None else f", residual lens k1 {bends[0]:+.4f}, k2 {bends[1]:+.4f}"
-    return f"refined focal lengths are {factor} times those of the capture{also}{residual}"
+    return f"refined focal lengths are {factor} times those of the capture{also}"
 
 
 def _frame(view: View, root: Path | None) -> dict[str, Any]:
@@ -83,16 +80,8 @@ def _frame(view: View, root: Path | None) -> dict[str, Any]:
         "T_cam_world": camera.T_cam_world.tolist(),
         **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
         **{"cx": camera.cx, "cy": camera.cy},
-        **({} if view.zoom is None else _refined(view.zoom)),
+        **({} if view.zoom is None else {"zoom": list(view.zoom)}),
     }
-
-
-def _refined(zoom: Zoom) -> dict[str, Any]:
-    """Return the refined intrinsics; a lens as nerfstudio's coefficients, its inverse to fourth order of the radius."""
-    if zoom.lens is None:
-        return {"zoom": list(zoom[:3])}
-    k1, k2 = zoom.lens
-    return {"zoom": list(zoom), "camera_model": "OPENCV", "k1": -k1, "k2": 3 * k1 * k1 - k2, "p1": 0.0, "p2": 0.0}
 
 
 def camera_motion(original: Camera, now: Camera, focus: np.ndarray, extent: float) -> dict[str, float]:

@@ -16,7 +16,6 @@ from gs2d.kernels.torch_kernels import finite
 from gs2d.render.backends import Backend
 from gs2d.training.learned.quantity import LearnedQuantity
 from gs2d.training.learned_rows import LearnedRows
-from gs2d.training.targets import Target
 
 Rows = Mapping[str, LearnedRows]
 """The rows of each quantity (``TrainState.learned``)."""
@@ -125,12 +124,6 @@ class LearnedTable:
         for name, quantity in self.quantities.items():
             given = quantity.camera(rows[name].values, index, given, learns=name in learning)
         return given
-
-    def target(self, rows: Rows, index: int, camera: Camera, target: Target) -> Target:
-        """Return the target of a training view as a rendering of ``camera`` shows it."""
-        for name, quantity in self.quantities.items():
-            target = quantity.target(rows[name].values, index, camera, target)
-        return target
 
     def leaves(self, rows: Rows, index: int, camera: Camera, like: Tensor) -> dict[str, Tensor]:
         """Return the tensors that ``appearance.shown`` applies to a rendering, as leaves of autograd."""

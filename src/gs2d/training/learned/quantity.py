@@ -16,7 +16,6 @@ from torch import Tensor
 from gs2d.config.quantities import Quantity
 from gs2d.core.camera import Camera
 from gs2d.data.scene import Scene, View
-from gs2d.training.targets import Target
 
 MOST_CURVES = 6  # more lines in one plot cannot be told apart
 
@@ -34,15 +33,12 @@ class ImagePoints:
         Background colour; given with ``coverage``.
     points : Tensor [N, 3], optional
         Centres of splats; the colours are then [1, N, 3]. None: the colours are an image [H, W, 3].
-    inside : Tensor [H, W] bool, optional
-        Pixels that the rendering covers after a quantity has moved it. Other pixels have no loss.
     """
 
     camera: Camera
     coverage: Tensor | None = None
     background: Tensor | None = None
     points: Tensor | None = None
-    inside: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -136,10 +132,6 @@ class LearnedQuantity:
     def camera(self, values: Tensor, index: int, camera: Camera, *, learns: bool) -> Camera:
         """Return the current camera of a training view; with ``learns``, it gets a gradient."""
         return camera
-
-    def target(self, values: Tensor, index: int, camera: Camera, target: Target) -> Target:
-        """Return the target of a training view as a rendering of ``camera`` shows it."""
-        return target
 
     @staticmethod
     def apply(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
