@@ -99,7 +99,7 @@ def test_masked_pixels_give_no_features(colmap: None, tmp_path: Path) -> None:
             lines.append(event.text)
 
     options = {"photos": tmp_path / "photos", "out": tmp_path / "capture", "masks": tmp_path / "masks", "threads": 1}
-    options["camera_model"] = "SIMPLE_PINHOLE"  # skips the lens comparison
+    options["camera_model"] = "SIMPLE_PINHOLE"  # no step that adjusts the lens
     found = find_poses(PosesOptions(**options), watch)  # type: ignore[arg-type]
     assert found["placed"] == 6
     assert found["masks"] == 6

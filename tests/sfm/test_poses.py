@@ -27,7 +27,7 @@ from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.training.events import Event, Notice, Phase
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
-ONE_LENS = ("--camera-model", "SIMPLE_PINHOLE")  # skips the lens comparison, half of the run time
+ONE_LENS = ("--camera-model", "SIMPLE_PINHOLE")  # no step that adjusts the lens
 
 
 def poses(photos: Path, out: Path, *words: str) -> int:
@@ -185,7 +185,7 @@ def test_a_camera_that_only_rotated_gives_a_warning(
     ("phase", "kept"),
     [
         ("matching pairs", "features of 12 photographs, [0-9]+ pairs"),  # the worker goes on matching until stopped
-        ("comparing lenses", "features of 12 photographs, 66 pairs, placed cameras"),
+        ("adjusting the lens", "features of 12 photographs, 66 pairs, placed cameras"),
     ],
 )
 def test_an_interrupted_search_continues_and_gives_the_same_bytes(

@@ -53,7 +53,7 @@ def test_a_search_that_is_killed_repeatedly_gives_the_same_result(colmap: None, 
     assert run(["poses", str(photos), "--out", str(tmp_path / "whole"), "--threads", "2", "--quiet"]) == 0
     out, work = tmp_path / "capture", tmp_path / ".capture.poses"
     words = [sys.executable, "-m", "gs2d", "poses", str(photos), "--out", str(out), "--threads", "2", "--overwrite"]
-    for phase in ("finding features", "matching pairs", "placing cameras", "placing cameras", "comparing lenses"):
+    for phase in ("finding features", "matching pairs", "placing cameras", "placing cameras", "adjusting the lens"):
         with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
             assert process.stderr is not None
             for line in process.stderr:

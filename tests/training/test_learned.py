@@ -153,4 +153,4 @@ def test_a_recipe_names_registered_quantities_once() -> None:
     assert list(learning.quantities) == ["intrinsics", "poses", "exposure"]  # in the order of application
     changed = apply_overrides(learning, ["learned.exposure.start=7", "learned.intrinsics.options.principal_point=true"])
     assert changed.quantities["exposure"] == replace(EXPOSURE, start=7)
-    assert changed.quantities["intrinsics"].options == {"distortion": True}
+    assert changed.quantities["intrinsics"].options == {"principal_point": True}
