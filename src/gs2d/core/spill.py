@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import tempfile
+import weakref
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from typing import IO, Any, Generic, TypeVar, overload
@@ -32,6 +33,7 @@ class SpillFile:
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the object
+                weakref.finalize(self, self._file.close)
             place = (self._file.seek(0, os.SEEK_END), len(packed))
             self._file.write(packed)
             return place
