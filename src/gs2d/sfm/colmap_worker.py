@@ -80,7 +80,7 @@ def map_(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> dict
     if names:
         if steps.facts("lens") is None:
             _settle_lens(pycolmap, request, names[0], steps, say)
-        lens = steps.facts("lens")
+        lens = steps.facts("lens") or {}
         if steps.facts("extended") is None:
             _extend(pycolmap, request, steps, say)
         names = ["extended", *names[1:]]
