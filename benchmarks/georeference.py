@@ -64,7 +64,7 @@ def prepared(folder: Path, photographs: int, size: int) -> tuple[Path, Truth]:
         program = [sys.executable, "-m", "gs2d"]
         if not capture.exists():
             subprocess.run([*program, "poses", flown / "images", "--out", capture], check=True)
-        short = ["--schedule-scale", "0.0005", "--set", "prepare=never"]
+        short = ["--schedule-scale", "0.0005"]
         subprocess.run([*program, "train", capture, "--out", run, "--recipe", "2dgs", *short], check=True)
     true = load_scene(flown)
     points = true.points

@@ -131,7 +131,7 @@ def values_of(parsed: object, field: str) -> list[object]:
         ("mesh run --set depth=median --set faces=9", "faces", 9),
         ("poses in --out out --set link=true", "link", True),
         ("survey run --set up=0,1,0", "up", (0, 1, 0)),
-        ("train in --out out --set prepare=never --set a=1", "overrides", ("a=1",)),
+        ("train in --out out --set stage2_cache_mb=9 --set a=1", "overrides", ("a=1",)),
     ],
 )
 def test_option_words_become_values(words: str, field: str, value: object) -> None:
