@@ -50,7 +50,7 @@ SHORT = {  # all three stages with few views: the same kinds of files as in a lo
 DATED = {"report.html", "run.json", "metrics.json", "verdict.json", "events.jsonl", ".lock", "poses.json"} | {
     "about.json",  # times, folder names
     "index.html",
-    *("table.csv", "table.md", "table.tex"),  # contents of table.json, including seconds
+    *("table.csv", "table.md"),  # contents of table.json, including seconds
 }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-VERSIONS = {"gltf-validator": "2.0.0-dev.3.10", "@playcanvas/splat-transform": "2.7.1"}
+VERSIONS = {"gltf-validator": "2.0.0-dev.3.10", "@playcanvas/splat-transform": "3.7.0"}
 
 
 def package(name: str) -> Path:
@@ -56,10 +56,11 @@ def node(script: str, *words: str) -> str:
     return done.stdout
 
 
-def splat_transform(*words: str | Path) -> None:
-    """Convert splats with splat-transform on the CPU."""
+def splat_transform(*words: str | Path) -> str:
+    """Convert splats with splat-transform on the CPU; return its output."""
     program = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
     done = subprocess.run(
         ["node", str(program), "-q", "-w", "-g", "cpu", *map(str, words)], capture_output=True, text=True, timeout=240
     )
     assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-1000:]
+    return done.stdout

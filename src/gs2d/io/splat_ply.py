@@ -20,6 +20,7 @@ from gs2d.errors import DataError
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, with_thickness
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 
+DISKS_COMMENT = "SplatRenderMode: 2dgs"  # says that splats with a third scale are disks: Brush, SplatTransform 3.2
 _ROT = ("rot_0", "rot_1", "rot_2", "rot_3")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _FIXED = ("x", "y", "z", *_DC, "opacity", "scale_0", "scale_1", *_ROT)
@@ -43,7 +44,8 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str = 
     splats : Splats
         On any device; float32 values are stored exactly (``layout="2dgs"``).
     layout : "2dgs" or "3dgs"
-        The official 2DGS layout, or the one for common viewers (with ``scale_2``, the thickness, after ``scale_1``).
+        The official 2DGS layout, or the one for common viewers (with ``scale_2``, the thickness, after ``scale_1``, and
+        a comment that the splats are disks).
 
     Raises
     ------
@@ -61,7 +63,7 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str = 
     if layout == "3dgs":
         rows["scale_2"] = with_thickness(columns["log_scales"])[:, 2]
     _fill(rows, [f"rot_{i}" for i in range(4)], columns["quats"])
-    write_ply(path, {"vertex": rows})
+    write_ply(path, {"vertex": rows}, comments=(DISKS_COMMENT,) if layout == "3dgs" else ())
 
 
 def _fill(rows: np.ndarray, names: list[str] | tuple[str, ...], columns: np.ndarray) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from gs2d.contrib.formats.gltf import EXTENSION
 from gs2d.core.splats import Splats
@@ -86,6 +87,31 @@ def test_splat_transform_writes_the_same_glb(tmp_path: Path) -> None:
     near(theirs, splats)
 
 
+def info(path: Path) -> dict[str, object]:
+    found: dict[str, object] = json.loads(splat_transform(path, "--info", "json", "null"))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "layout"), [("a.ply", "3dgs"), ("a.ply", "2dgs"), ("a.compressed.ply", "compressed"), ("a.sog", "sog")]
+)
+def test_the_tag_of_disks_reaches_splat_transform_and_what_it_writes(tmp_path: Path, name: str, layout: str) -> None:
+    path = tmp_path / name
+    write_layout(path, a_scene(60, 1), layout)
+    assert info(path)["model"] == "2dgs"
+    for other in ("c.ply", "c.sog"):
+        splat_transform(path, tmp_path / other)
+        assert info(tmp_path / other)["model"] == "2dgs"
+        found = read_splat_file(tmp_path / other)
+        assert found.surfels is not None
+        assert len(found.surfels) == 60
+    assert "scale_2" not in splat_header(tmp_path / "c.ply")
+
+
+def splat_header(path: Path) -> str:
+    return path.read_bytes().partition(b"end_header")[0].decode()
+
+
 def test_sog_is_exchanged_with_splat_transform(tmp_path: Path) -> None:
     splats = a_scene(900, 3)
     write_layout(tmp_path / "a.ply", splats, "3dgs")
@@ -117,45 +143,48 @@ def test_spz_4_is_exchanged_with_splat_transform(tmp_path: Path) -> None:
     splat_transform(tmp_path / "a.ply", tmp_path / "theirs.spz")
     theirs = read_splat_file(tmp_path / "theirs.spz")
     assert theirs.kind == "SPZ version 4"
+    # It stores coordinates as they are, where the format has y up: half a turn about x.
+    bits = {"means": 3e-4, "scales": 0.04, "quats": 0.3, "sh0": 0.015}
+    near(theirs.gaussians.mirrored((1, -1, -1)), splats, **bits, shN=0.1)
     write_layout(tmp_path / "ours.spz", splats, "spz4")
     splat_transform(tmp_path / "ours.spz", tmp_path / "back.ply")
-    bits = {"means": 3e-4, "scales": 0.04, "quats": 0.3, "sh0": 0.015}
-    near(read_splat_file(tmp_path / "back.ply").gaussians, splats, **bits, shN=0.05)
+    near(read_splat_file(tmp_path / "back.ply").gaussians.mirrored((1, -1, -1)), splats, **bits, shN=0.05)
 
 
-def test_the_finest_level_of_a_splat_transform_stream_has_all_splats(tmp_path: Path) -> None:
+@pytest.fixture
+def their_stream(tmp_path: Path) -> Path:
+    """700 splats in a stream of SplatTransform, with a level of every other splat."""
     splats = a_scene(700, 1)
     write_layout(tmp_path / "a.ply", splats, "3dgs")
-    (tmp_path / "lods").mkdir()
-    path = tmp_path / "lods" / "lod-meta.json"
-    splat_transform(tmp_path / "a.ply", "-l", "0", tmp_path / "a.ply", "-F", "50%", "-l", "1", path)
-    found = read_splat_file(path)
+    write_layout(tmp_path / "half.ply", splats.rows(torch.arange(0, 700, 2)), "3dgs")
+    path = tmp_path / "theirs" / "lod-meta.json"
+    splat_transform(tmp_path / "a.ply", "-l", "0", tmp_path / "half.ply", "-l", "1", path)
+    return path
+
+
+def test_the_finest_level_of_a_splat_transform_stream_has_all_splats(their_stream: Path) -> None:
+    found = read_splat_file(their_stream)
     assert (found.kind, len(found.gaussians)) == ("streamed SOG, its finest level", 700)
 
 
-def test_splat_transform_reads_streams_and_writes_the_same_index(tmp_path: Path) -> None:
-    """It reads no index, but every data set that one refers to."""
-    splats = a_scene(900, 1)
+def test_splat_transform_reads_streams_and_writes_the_same_index(tmp_path: Path, their_stream: Path) -> None:
     path = tmp_path / "ours" / "lod-meta.json"
-    write_layout(path, splats, "streamed")
-    ours = json.loads(path.read_text())
+    write_layout(path, a_scene(900, 1), "streamed")
+    ours, theirs = (json.loads(file.read_text()) for file in (path, their_stream))
+    facts = info(path)
+    assert (facts["model"], facts["numLods"], facts["lodCounts"]) == ("2dgs", 4, ours["counts"])
     assert len(ours["filenames"]) == 4
     for number, name in enumerate(ours["filenames"]):
         splat_transform(path.parent / name, tmp_path / "back.ply")
         back = read_splat_file(tmp_path / "back.ply").gaussians
         same = read_splat_file(path.parent / name).gaussians
         assert len(back) == ours["counts"][number]
-        for what in ("means", "log_scales", "sh0", "shN"):
+        for what in ("means", "sh0", "shN"):
             np.testing.assert_allclose(getattr(back, what), getattr(same, what), atol=1e-6, err_msg=what)
-        (tmp_path / "back.ply").unlink()
-    write_layout(tmp_path / "a.ply", splats, "3dgs")
-    (tmp_path / "theirs").mkdir()
-    splat_transform(
-        tmp_path / "a.ply", "-l", "0", tmp_path / "a.ply", "-F", "50%", "-l", "1", tmp_path / "theirs" / "lod-meta.json"
-    )
-    theirs = json.loads((tmp_path / "theirs" / "lod-meta.json").read_text())
+        np.testing.assert_allclose(back.log_scales[:, :2], same.log_scales[:, :2], atol=1e-6)
     assert set(ours) == set(theirs)
+    assert (ours["lodErrors"], theirs["lodErrors"]) == (True, False)  # measuring them needs a GPU there
     leaf, other = ours["tree"], theirs["tree"]
-    assert set(leaf) == set(other) == {"bound", "lods"}
+    assert set(leaf) == {"bound", "lods", "errors"} == set(other) | {"errors"}
     assert set(leaf["bound"]) == set(other["bound"])
     assert set(leaf["lods"]["0"]) == set(other["lods"]["0"])

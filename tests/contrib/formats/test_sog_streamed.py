@@ -12,7 +12,7 @@ import pytest
 
 from gs2d.contrib.formats import sog_streamed
 from gs2d.contrib.formats.sog import read_sog
-from gs2d.errors import DiskError
+from gs2d.errors import BackendError, DiskError
 from gs2d.io.formats.splat_formats import read_splat_file, write_layout, written_bytes
 from gs2d.io.gaussians import Gaussians
 from splat_scenes import a_scene
@@ -61,6 +61,36 @@ def test_each_leaf_contains_its_splats_of_every_level(tmp_path: Path) -> None:
             assert (g.means <= np.array(leaf["bound"]["max"]) + 1e-3).all()
     assert all((times == 1).all() for times in seen)  # every splat of every set is in one leaf
     assert written_bytes(path, "streamed") == sum(f.stat().st_size for f in path.parent.rglob("*") if f.is_file())
+
+
+@pytest.mark.usefixtures("native")
+def test_errors_are_larger_where_merging_changes_more(tmp_path: Path) -> None:
+    """On the left each splat is there twice, so that merging loses nothing but the outline; the right is random."""
+    left, right = a_scene(50, 0, seed=2), a_scene(100, 0)
+    left = left.followed_by(left)
+    left.means[:, 0] -= 20
+    write_layout(tmp_path / "lod-meta.json", left.followed_by(right), "streamed")
+    index = json.loads((tmp_path / "lod-meta.json").read_text())
+    assert index["lodErrors"] is True
+    two = sorted(leaves(index["tree"]), key=lambda leaf: float(leaf["bound"]["min"][0]))
+    assert len(two) == 2
+    for leaf in two:
+        errors = leaf["errors"]
+        assert len(errors) == 4
+        assert errors == sorted(errors)
+        assert errors[0] == 0 < errors[-1] < 2
+    assert two[0]["errors"][1] < 0.2 * two[1]["errors"][1]
+
+
+def test_without_the_native_library_there_are_no_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise BackendError("no native library")
+
+    monkeypatch.setattr(sog_streamed, "get_backend", missing)
+    write_layout(tmp_path / "lod-meta.json", a_scene(150, 0), "streamed")
+    index = json.loads((tmp_path / "lod-meta.json").read_text())
+    assert index["lodErrors"] is False
+    assert not any("errors" in leaf for leaf in leaves(index["tree"]))
 
 
 def test_writing_again_removes_files_of_the_older_index_only(tmp_path: Path) -> None:

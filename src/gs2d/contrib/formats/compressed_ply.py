@@ -21,6 +21,7 @@ from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
+from gs2d.io.splat_ply import DISKS_COMMENT
 
 _CHUNK = 256
 _BITS = (11, 10, 11)
@@ -74,7 +75,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
         for i in range(rest.shape[1]):
             sh[f"f_rest_{i}"] = np.clip(np.floor((np.clip(rest[:, i], -8.0, 8.0) / 8.0 + 0.5) * 256.0), 0, 255)
         elements["sh"] = sh
-    write_ply(path, elements, comments=("written by gs2d",))
+    write_ply(path, elements, comments=("written by gs2d", DISKS_COMMENT))
     steep = int((np.abs(g.shN) > 4.0).any(axis=(1, 2)).sum()) if g.shN.size else 0
     return (f"{steep} of {n} splats have SH coefficients beyond 4, the limit of the format",) if steep else ()
 

@@ -1,4 +1,4 @@
-"""Read and write glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of February 2026).
+"""Read and write glTF 2.0 with ``KHR_gaussian_splatting`` (as ratified in 2026).
 
 The only kernel is the projected ellipsoid, so a disk gets a negligible thickness. Attributes are float32 after
 activation: unit quaternions, linear scales, linear opacities; spherical harmonics are those of 3DGS. glTF has y up. As

@@ -53,9 +53,9 @@ def write_sog(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def packed_sog(g: Gaussians) -> dict[str, bytes]:
-    """Return the files of an SOG data set by name, meta.json last; the order of the splats is kept."""
+    """Return the files of an SOG data set of disks by name, meta.json last; the order of the splats is kept."""
     shape = _image(len(g))
-    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "gs2d"}, "count": len(g)}
+    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "gs2d"}, "count": len(g), "model": "2dgs"}
     images: dict[str, np.ndarray] = {}
 
     logs = np.sign(g.means) * np.log1p(np.abs(g.means.astype(np.float64)))

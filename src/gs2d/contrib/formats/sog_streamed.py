@@ -1,7 +1,8 @@
 """Write the streamed form of SOG: levels of detail in spatial chunks, which a viewer loads on demand.
 
 ``lod-meta.json`` contains a tree of boxes. Each leaf refers, for every level, to its splats in an SOG data set (file,
-offset, count); level 0 is the finest. The folders of the data sets are beside it.
+offset, count); level 0 is the finest. Its ``errors`` say how much each level deviates from the finest. The folders of
+the data sets are beside it. Follows the format description (developer.playcanvas.com, version 1, with ``lodErrors``).
 """
 
 from __future__ import annotations
@@ -22,15 +23,22 @@ from gs2d.contrib.formats.compressed_ply import morton_order
 from gs2d.contrib.formats.levels import halved
 from gs2d.contrib.formats.sog import packed_sog
 from gs2d.core.atomic_files import atomic_write, disk_error
+from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
+from gs2d.errors import BackendError
 from gs2d.io.formats.splat_formats import register_format
 from gs2d.io.gaussians import Gaussians, unit_quats
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend, get_backend
+from gs2d.render.types import RasterSettings
 
 INDEX = "lod-meta.json"
 LEVELS = 4  # at least: 1, 1/2, 1/4 and 1/8 of the splats
 _MOST_LEVELS, _COARSEST = 8, 250_000  # further levels are added until the coarsest has at most this many splats
 _LEAF = 16_384  # largest number of splats of the finest level in a leaf
 _FILE = 131_072  # approximate number of splats in a data set
+_VIEW = 256  # px, side of the images that compare levels: about two per splat of a full leaf on a surface
+_DISTANCE = 8.0  # of their cameras from the middle of a leaf, in radii of its box
 _REACH = 3.0  # standard deviations of splats that a box contains
 _PARTS = ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
 
@@ -88,7 +96,14 @@ def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians, *, le
         index = _written(path.parent, folder, made)
         bounds = [level.bounds() for level in made]
         low, high = (f([ends[k] for ends in bounds], axis=0) for k, f in ((0, np.min), (1, np.max)))
-        index["tree"] = _node(tree, low, high, index.pop("leaves"))
+        leaves = [{"lods": lods} for lods in index.pop("leaves")]
+        with contextlib.suppress(BackendError):  # without the native library readers estimate errors from the counts
+            backend = get_backend("cpu")
+            for number, leaf in enumerate(leaves):
+                parts = [level.gaussians.rows(np.arange(*level.ends[number : number + 2])) for level in made]
+                leaf["errors"] = _errors(parts, low[number], high[number], backend)
+            index["lodErrors"] = True
+        index["tree"] = _node(tree, low, high, leaves)
         with atomic_write(path, "w") as file:
             file.write(json.dumps(index, separators=(",", ":")))
     for name in older:
@@ -154,6 +169,7 @@ def _written(home: Path, folder: str, levels: list[_Level]) -> dict[str, Any]:
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
+        "lodErrors": False,
         "filenames": names,
         "leaves": leaves,
     }
@@ -169,11 +185,33 @@ def _write_set(folder: Path, g: Gaussians) -> None:
             file.write(data)
 
 
-def _node(tree: Any, low: np.ndarray, high: np.ndarray, leaves: list[dict[str, dict[str, int]]]) -> dict[str, Any]:
+def _errors(levels: list[Gaussians], low: np.ndarray, high: np.ndarray, backend: Backend) -> list[float]:
+    """Return how much each level of a leaf deviates from the finest, finite and not decreasing.
+
+    The measure is that of SplatTransform: squared differences of images, with alpha, relative to the squared images of
+    the finest level, summed over views along the six directions of the axes. Only ratios of the errors matter.
+    """
+    if not len(levels[0]):  # and no box
+        return [0.0] * len(levels)
+    total, errors = 0.0, np.zeros(len(levels))
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    settings = RasterSettings(near=radius, with_distortion=False)
+    for side, axis in itertools.product((-1.0, 1.0), range(3)):
+        eye, up = middle + side * _DISTANCE * radius * np.eye(3)[axis], np.eye(3)[axis - 1]
+        camera = look_at(eye, middle, up, width=_VIEW, height=_VIEW, fx=_DISTANCE * _VIEW / 2)
+        drawn = [rasterize(level.disks(), camera, settings, backend=backend) for level in levels]
+        images = [np.dstack([image.color.numpy(), image.alpha.numpy()]).astype(np.float64) for image in drawn]
+        total += np.square(images[0]).sum()
+        errors += [np.square(image - images[0]).sum() for image in images]
+    relative = np.maximum.accumulate(errors / total if total else errors)
+    return [float(f"{error:.7g}") for error in relative]
+
+
+def _node(tree: Any, low: np.ndarray, high: np.ndarray, leaves: list[dict[str, Any]]) -> dict[str, Any]:
     if isinstance(tree, int):
         ends = (low[tree], high[tree]) if np.isfinite(low[tree]).all() else (np.zeros(3), np.zeros(3))
         bound = {key: [float(f"{value:.7g}") for value in end] for key, end in zip(("min", "max"), ends, strict=True)}
-        return {"bound": bound, "lods": leaves[tree]}
+        return {"bound": bound, **leaves[tree]}
     children = [_node(child, low, high, leaves) for child in tree]
     bound = {
         key: [float(value) for value in merge([child["bound"][key] for child in children], axis=0)]

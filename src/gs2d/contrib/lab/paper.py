@@ -14,7 +14,7 @@ from gs2d.contrib.lab.deviations import deviations_of
 from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
 from gs2d.contrib.lab.paper_tables import DTU, TNT, PaperRow, PaperTable
-from gs2d.contrib.lab.render import to_latex, to_markdown, write_page
+from gs2d.contrib.lab.render import to_markdown, write_page
 from gs2d.contrib.lab.scenes import FoundScene
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
 from gs2d.contrib.lab.table_plan import Plan, commands_of, make_plan, paper_command
@@ -128,7 +128,7 @@ def _defining(options: TableOptions) -> dict[str, Any]:
 
 # -- tabulating ------------------------------------------------------------------------------------------------------
 def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> PaperResult:
-    """Write table.json, .md, .tex, about.json and, with images, index.html from the finished runs."""
+    """Write table.json, table.md, about.json and, with images, index.html from the finished runs."""
     unfinished = sum(task.outcome()["state"] not in ("done", "failed") for task in plan.tasks)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     checked = check_claims(plan.table, results)
@@ -138,14 +138,9 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> 
     commands = [line for task in plan.tasks for line in commands_of(task)]
     write_json(out / "table.json", [row_json(row, results, deviations) for row in results.rows])
     write_json(out / ABOUT, {**facts, "deviations": deviations})
-    texts = {
-        "table.md": to_markdown(plan.table, results, checked, deviations, [facts["command"], *commands]),
-        "table.tex": to_latex(plan.table, results),
-    }
-    for name, text in texts.items():
-        with atomic_write(out / name, "w") as file:
-            file.write(text)
-    files = [out / name for name in ("table.json", *texts, ABOUT)]
+    with atomic_write(out / "table.md", "w") as file:
+        file.write(to_markdown(plan.table, results, checked, deviations, [facts["command"], *commands]))
+    files = [out / name for name in ("table.json", "table.md", ABOUT)]
     if images:
         files.append(write_page(plan.table, results, checked, deviations, commands, facts, out))
     return PaperResult(plan.table, tuple(files), results, checked, failures(plan.tasks), unfinished)

@@ -1,4 +1,4 @@
-"""Writes a table as a page, Markdown, CSV and LaTeX, with measured figures and those of the paper."""
+"""Writes a table as a page and as Markdown, with measured figures and those of the paper."""
 
 from __future__ import annotations
 
@@ -198,47 +198,6 @@ def to_markdown(
     """Return the whole result as Markdown."""
     values = {"table": table, "checked": checked, "deviations": deviations, "commands": commands}
     return _templates().get_template("table.md").render(values, parts=parts_of(table, results))
-
-
-_TEX = str.maketrans(
-    {
-        **{c: f"\\{c}" for c in "&%_#${}"},
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "<": r"\textless{}",
-        ">": r"\textgreater{}",
-        "±": r"$\pm$",
-        "↓": r"$\downarrow$",
-        "↑": r"$\uparrow$",
-    }
-)
-
-
-def to_latex(table: PaperTable, results: Results) -> str:
-    """Return ``booktabs`` tables in one float: measured figures, with those of the paper in small print.
-
-    Data sets without runs follow, with the figures of the paper.
-    """
-    lines = ["% \\usepackage{booktabs}", "\\begin{table}", "  \\centering"]
-    for part in parts_of(table, results):
-        heads = [part.data_set, *(head.replace(" ↑", "↑").replace(" ↓", "↓") for head in part.heads)]
-        lines += [f"  \\begin{{tabular}}{{l{'c' * len(part.columns)}}}", "    \\toprule"]
-        lines += ["    " + " & ".join(head.translate(_TEX) for head in heads) + r" \\", "    \\midrule"]
-        for row in part.rows:
-            papers = [f"\\footnotesize({figure.paper})" if figure.paper else "" for figure in row.figures]
-            ours = [figure.measured.translate(_TEX) for figure in row.figures]
-            ours = [f"\\textbf{{{text}}}" if f.best else text for f, text in zip(row.figures, ours, strict=True)]
-            if not any(ours):
-                ours, papers = [figure or "-" for figure in papers], []
-            lines.append(f"    {row.name.translate(_TEX)} & " + " & ".join(ours) + r" \\")
-            if any(papers):
-                lines.append("     & " + " & ".join(papers) + r" \\")
-        lines += ["    \\bottomrule", "  \\end{tabular}", "  \\par\\medskip"]
-    quoted = " In brackets: the figures of the paper." if table.of_paper else ""
-    caption = f"{table.title}.{quoted}".translate(_TEX)
-    lines += [f"  \\caption{{{caption}}}", f"  \\label{{{table.label}-measured}}", "\\end{table}", ""]
-    return "\n".join(lines)
 
 
 # -- the page ----------------------------------------------------------------------------------------------------------
