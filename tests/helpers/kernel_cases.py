@@ -80,12 +80,17 @@ def cases_with_margins(count: int = 60) -> list[Case]:
 
 
 def gradients(
-    run: Callable[..., RenderOutput], splats: Splats, camera: Camera, cotangents: dict[str, Tensor], columns: int
+    run: Callable[..., RenderOutput],
+    splats: Splats,
+    camera: Camera,
+    cotangents: dict[str, Tensor],
+    columns: int,
+    settings: RasterSettings = SETTINGS,
 ) -> dict[str, Tensor]:
     """Return vector-Jacobian products of all parameters and the probe."""
     scene = requiring_grad(splats)
     probe = torch.zeros(len(splats), columns, dtype=splats.dtype, requires_grad=True)
-    contraction(run(scene, camera, SETTINGS, probe), cotangents).backward()
+    contraction(run(scene, camera, settings, probe), cotangents).backward()
     assert probe.grad is not None
     grads = {name: tensor.grad for name, tensor in scene.items()} | {"signed": probe.grad[:, :2]}
     if columns == 4:

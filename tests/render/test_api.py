@@ -29,6 +29,7 @@ from render_scenes import front_camera, splat
         ({"transmittance_min": 0.7}, "transmittance_min must be in"),
         ({"error_cutoff": -3.0}, "positive"),
         ({"lowpass_px": 0.0}, "positive"),
+        ({"mip_px": -0.1}, "0 or positive"),
         ({"background": (0.0, 0.0, 2.0)}, "numbers"),
         ({"background": (0.0, 0.0)}, "numbers"),
         ({"sh_degree": 4}, "colours"),

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from gs2d.core.camera import look_at
-from gs2d.render.api import rasterize
+from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from render_scenes import GREEN, RED, Y_AXIS, equal, front_camera, requiring_grad, splat, stack
@@ -241,3 +241,49 @@ def test_06_alpha_is_limited_and_the_limit_passes_gradients(backend: Backend) ->
     # d alpha / d logit = o (1 - o), as if alpha were not clamped. o = sigmoid(logit) in float32.
     o = torch.sigmoid(scene.opacity_logits.detach().double())
     equal(scene.opacity_logits.grad, o * (1 - o))
+
+
+# 24 --------------------------------------------------------------------------------------------------------------
+def test_24_the_mip_filter_widens_a_splat_and_keeps_its_integral(backend: Backend) -> None:
+    # Standard deviations of 2 px on the screen become sqrt(4 + 1) px, and the opacity 4/5 of what it was.
+    alpha = rasterize(splat(), front_camera(), RasterSettings(mip_px=1.0), backend=backend).alpha
+    equal(alpha[4, 4:8], [0.5 * 4 / 5 * exp(-k * k / 10) for k in range(4)])
+    # 0.25 px along y becomes sqrt(1 + 1/16) px.
+    alpha = rasterize(splat(scales=(0.4, 0.05)), front_camera(), RasterSettings(mip_px=1.0), backend=backend).alpha
+    loss = sqrt(4 / 5) * sqrt(1 / 17)
+    equal(alpha[4:6, 4], [0.5 * loss, 0.5 * loss * exp(-8 / 17)])
+    sums = [
+        float(rasterize(splat(scales=(0.3, 0.2)), front_camera(41, 41), settings, backend=backend).alpha.sum())
+        for settings in (RasterSettings(alpha_min=1e-5), RasterSettings(alpha_min=1e-5, mip_px=2.0))
+    ]
+    assert sums[0] == pytest.approx(sums[1], rel=1e-3)
+
+
+def test_24_the_mip_filter_keeps_the_plane_and_replaces_the_low_pass_filter(backend: Backend) -> None:
+    # Rotated 45 degrees about y, s_u = 0.02: 0.0707 px along x, 0.1 px along y. Pixel (5, 4) hits u = 12.86, z = 2 / 1.1.
+    scene = splat(scales=(0.02, 0.02), opacity=0.9, axis=Y_AXIS, degrees=45)
+    settings = RasterSettings(mip_px=0.3, alpha_min=1e-4)
+    l11, l22 = sqrt(1 + 0.3**2 / 0.005), sqrt(1 + 0.3**2 / 0.01)
+    out = rasterize(scene, front_camera(), settings, backend=backend)
+    u = (2 / 1.1 * 0.1) / cos(radians(45)) / 0.02
+    equal(out.depth_mean[4, 5], 2 / 1.1)
+    equal(out.alpha[4, 4:6], [0.9 / (l11 * l22), 0.9 / (l11 * l22) * exp(-0.5 * (u / l11) ** 2)])
+
+
+def test_24_the_filtered_opacity_culls_and_so_does_a_filter_that_is_too_wide(backend: Backend) -> None:
+    # 0.05 px: the opacity is divided by 1 + (0.5 / 0.05)^2 = 101, to 0.0049 or 0.0030; 1/255 = 0.0039.
+    tiny, settings = (0.01, 0.01), RasterSettings(mip_px=0.5)
+    alphas = [
+        rasterize(splat(scales=tiny, opacity=opacity), front_camera(), settings, backend=backend).alpha
+        for opacity in (0.5, 0.3)
+    ]
+    equal(alphas[0][4, 4], 0.5 / 101)
+    equal(alphas[1], torch.zeros(9, 9))
+    # 0.005 px counts in splat errors, whose footprint does not depend on the opacity; a factor of 2501; 0.0005 px: 250,001.
+    image = torch.zeros(9, 9, 3)
+    errors = [
+        float(splat_errors(splat(scales=(s, s)), front_camera(), image, replace(settings, mip_px=0.25), backend=backend)[0])
+        for s in (0.001, 0.0001)
+    ]
+    assert errors[0] > 0
+    assert errors[1] == 0.0

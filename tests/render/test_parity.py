@@ -85,6 +85,7 @@ def test_a_larger_image_with_many_tiles_and_layers_agrees(native: Backend) -> No
         {"alpha_min": 0.05, "alpha_max": 0.9},
         {"transmittance_min": 0.2},
         {"lowpass_px": 1.7},
+        {"mip_px": 0.5},
         {"sh_degree": 1, "background": (1.0, 1.0, 1.0)},
         {"near_plane_policy": "cull"},
         {"near_plane_policy": "box"},
@@ -106,16 +107,17 @@ def test_every_setting_is_used_alike(native: Backend, part: int, change: dict[st
     assert moved > 1 / part  # the setting has an effect
 
 
-@pytest.mark.parametrize("columns", [2, 4])
+@pytest.mark.parametrize(("columns", "mip_px"), [(2, 0.0), (4, 0.0), (4, 0.5)])
 def test_gradients_agree_where_every_decision_has_a_margin(
-    native: Backend, part: int, clear_cases: list[Case], columns: int
+    native: Backend, part: int, clear_cases: list[Case], columns: int, mip_px: float
 ) -> None:
     """Random cotangents on all images at once; relative Frobenius norm per attribute."""
+    settings = replace(SETTINGS, mip_px=mip_px)
     errors: dict[str, list[float]] = {name: [] for name in (*ATTRIBUTES, "signed", "absolute")}
     for case in clear_cases[columns // 4 :: 2 * part]:
         cotangents = random_cotangents(np.random.default_rng(case.seed), case.camera)
-        low = gradients(native.rasterize, case.splats, case.camera, cotangents, columns)
-        high = gradients(reference.rasterize, double(case.splats), case.camera, cotangents, columns)
+        low = gradients(native.rasterize, case.splats, case.camera, cotangents, columns, settings)
+        high = gradients(reference.rasterize, double(case.splats), case.camera, cotangents, columns, settings)
         for name, expected in high.items():
             norm = float(expected.norm())
             if norm > 1e-3:

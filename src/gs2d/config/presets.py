@@ -49,6 +49,8 @@ SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and the fraction of 
 SH_FASTER = 2.5  # factor of the official rate of SH beyond degree 0: docs/notebook/training.md
 SETTLING, SETTLED = 0.3, 0.1  # last fraction of iterations in which rates fall, and final factor: training.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=True)  # docs/notebook/training.md
+# px; standard deviation of a pixel, a square of side 1 (0.29), rounded: docs/notebook/best.md
+MIP_FILTER = 0.3
 STREET_START = DenseStart(sphere=True)  # docs/notebook/floaters.md
 
 
@@ -232,7 +234,7 @@ def best(
         sh_interval=round(1_000 * part),
     )
     start = replace(DENSE_START, required=False, sphere=True)
-    return Recipe(name, (stage,), dense_start=start, fused_depth="transmittance")
+    return Recipe(name, (stage,), dense_start=start, fused_depth="transmittance", mip_px=MIP_FILTER)
 
 
 def _best_rates(iterations: int) -> LearningRates:

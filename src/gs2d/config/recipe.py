@@ -303,6 +303,8 @@ class Recipe:
         Removes floaters.
     fused_depth : "mean", "median", "transmittance" or None
         Depth that is fused into the mesh; None: that of the protocol.
+    mip_px : float
+        px. Standard deviation of the object-space Mip filter; 0: the low-pass filter of 2DGS.
 
     Examples
     --------
@@ -324,6 +326,7 @@ class Recipe:
     dense_start: DenseStart | None = None
     removal: Removal | None = None
     fused_depth: str | None = None
+    mip_px: float = 0.0
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -411,6 +414,7 @@ def validate(recipe: Recipe) -> Recipe:
     check_priors(where, recipe.depth_prior, recipe.normal_prior)
     if recipe.fused_depth is not None:
         one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)
+    number(f"{where}: mip_px", recipe.mip_px, low=0.0)
     check_robust(where, recipe.dense_start, recipe.removal)
     names = [stage.name for stage in recipe.stages]
     for name in names:

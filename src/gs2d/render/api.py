@@ -11,7 +11,7 @@ opacity o and colour c. A *pair* is a splat and a pixel. k^2 = 2 ln(o / alpha_mi
  3. *Intersection.* The ray of the pixel intersects the splat's plane at p + u s_u t_u + v s_v t_v, at depth z along
     the optical axis; rho3d = u^2 + v^2. If the ray is parallel to the plane or the intersection has z <= 0, there is
     no hit and rho3d is infinite.
- 4. *Low-pass filter.* rho2d = |pixel - c|^2 / lowpass_px^2, where c is the projection of p; rho = min(rho3d, rho2d).
+ 4. *Low-pass filter* (see 24). rho2d = |pixel - c|^2 / lowpass_px^2, where c is the projection of p; rho = min(rho3d, rho2d).
     If rho3d <= rho2d, the pair's depth is z. Otherwise it is z_c (``lowpass_depth="center"``), or z (``"plane"``,
     reference only; z_c without a hit).
  5. *Near.* A splat with z_c <= near is culled; a pair with depth < near is skipped. Splats that cross the near plane
@@ -74,6 +74,11 @@ opacity o and colour c. A *pair* is a splat and a pixel. k^2 = 2 ln(o / alpha_mi
     degree) sum to more than 1e15, or if no component of its quaternion reaches 1e-15, which counts as a zero
     quaternion. A scale below 1e-18 world units counts as 1e-18. Longer quaternions are normalised, and an opacity logit
     may be any finite number.
+24. *Mip filter*, only with settings.mip_px = sigma > 0; it replaces 4. A Gaussian of sigma px on the screen, mapped to
+    the splat's plane at its centre, is added to the splat's Gaussian: with J = d(u, v) / d(pixel) at the centre and
+    L L^T = I + sigma^2 J J^T, the axes (s_u t_u, s_v t_v) become (s_u t_u, s_v t_v) L and the opacity o / det L. All
+    other rules see these axes and this opacity; in 13, L does not depend on Tu and Tv. A splat with det L > 1e4 is
+    culled.
 """
 
 from __future__ import annotations
@@ -352,6 +357,7 @@ def check_settings(s: RasterSettings) -> None:
     require(0 < s.transmittance_min < 0.5, "transmittance_min", "in (0, 0.5)")
     require(math.isfinite(s.error_cutoff) and s.error_cutoff > 0, "error_cutoff", "positive")
     require(math.isfinite(s.lowpass_px) and s.lowpass_px > 0, "lowpass_px", "positive")
+    require(math.isfinite(s.mip_px) and s.mip_px >= 0, "mip_px", "0 or positive")
     if s.sh_degree == PLAIN_COLORS:
         require(len(s.background) == 3 and all(map(math.isfinite, s.background)), "background", "3 finite numbers")
     else:

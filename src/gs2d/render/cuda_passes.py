@@ -143,9 +143,9 @@ def view_of(camera: Camera, settings: RasterSettings) -> KernelView:
     view.background[:] = [float(c) for c in settings.background]
     for name in ("fx", "fy", "cx", "cy", "width", "height"):
         setattr(view, name, getattr(camera, name))
-    for name in ("near", "lowpass_px", "alpha_max", "transmittance_min", "sh_degree"):
+    for name in ("near", "mip_px", "alpha_max", "transmittance_min", "sh_degree"):
         setattr(view, name, getattr(settings, name))
-    view.inv_lowpass2 = 1 / settings.lowpass_px**2
+    view.lowpass_px, view.inv_lowpass2 = settings.clamp_px, 1 / settings.clamp_px**2
     view.log2_alpha_min = math.log2(settings.alpha_min)
     view.error_k2, view.near_plane_policy = (
         settings.error_cutoff**2,

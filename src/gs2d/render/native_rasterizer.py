@@ -33,7 +33,7 @@ __all__ = [
     "view_of",
 ]
 
-CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
+CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "clamp_px", "mip_px")
 
 
 class _View(ctypes.Structure):

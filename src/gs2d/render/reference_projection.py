@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -16,7 +16,15 @@ from gs2d.core.camera import Camera
 from gs2d.core.sh import num_coefficients, sh_to_rgb
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.render.types import MAX_COLOR, MAX_SIZE, MIN_QUATERNION, MIN_SIZE, PLAIN_COLORS, RasterSettings
+from gs2d.render.types import (
+    MAX_COLOR,
+    MAX_SIZE,
+    MAX_WIDENING,
+    MIN_QUATERNION,
+    MIN_SIZE,
+    PLAIN_COLORS,
+    RasterSettings,
+)
 
 TILE = 16  # px; side of the blocks of pixels that share a list of splats
 MAX_PAIRS = 1 << 21  # pairs of splat and pixel evaluated at once; bounds the memory
@@ -53,7 +61,7 @@ class PixelBlock:
 
 
 def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, for_errors: bool) -> Tensor:
-    """Return the rows that rules 5, 6, 16, 19 and 23 do not cull, by increasing depth, ties by index (rule 2).
+    """Return the rows that rules 5, 6, 16, 19, 23 and 24 do not cull, by increasing depth, ties by index (rule 2).
 
     Returns
     -------
@@ -70,23 +78,20 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
     keep &= (at.abs() <= MAX_SIZE).all(dim=1)
     depth = at[:, 2]
     keep &= depth > settings.near
-    if settings.near_plane_policy == "cull":
-        keep &= depth**2 > settings.error_cutoff**2 * _slant_squared(used, camera)
-    if not for_errors:
-        keep &= used.opacities >= settings.alpha_min
     rows = keep.nonzero()[:, 0]
+    screen = project(used, rows, camera, settings)
+    keep = screen.opacity * MAX_WIDENING >= used.opacities[rows]
+    if settings.near_plane_policy == "cull":
+        slant = screen.Tw[:, :2].square().sum(dim=1)  # the squared depth range of one sigma
+        keep &= screen.Tw[:, 2] ** 2 > settings.error_cutoff**2 * slant
+    if not for_errors:
+        keep &= screen.opacity >= settings.alpha_min
+    rows = rows[keep]
     return rows[depth[rows].sort(stable=True).indices]
 
 
-def _slant_squared(splats: Splats, camera: Camera) -> Tensor:
-    """Return (s_u t_u.z)^2 + (s_v t_v.z)^2 in the camera frame [N]: the squared depth range of one sigma."""
-    tangents = quats_to_matrices(splats.quats)[:, :, :2] * splats.scales[:, None, :]  # [N, 3, 2]
-    forward = torch.as_tensor(camera.rotation[2].copy(), dtype=tangents.dtype, device=tangents.device)
-    return torch.einsum("j,njk->nk", forward, tangents).square().sum(dim=1)
-
-
 def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettings) -> ScreenSplats:
-    """Project splats to a camera; differentiable.
+    """Project splats to a camera, with the Mip filter, if there is one; differentiable.
 
     Parameters
     ----------
@@ -123,7 +128,7 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
         color = sh_to_rgb(splats.sh0[rows], splats.shN[rows], directions, degree)
     normal = frames[:, :, 2]
     away = (normal * to_splat).sum(dim=1).detach() > 0  # rule 8
-    return ScreenSplats(
+    screen = ScreenSplats(
         center=focal * offset + principal,
         Au=Au * third,
         Av=Av * third,
@@ -131,6 +136,29 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
         opacity=splats.opacity_logits[rows].sigmoid(),
         color=color,
         normal=torch.where(away[:, None], -normal, normal),
+    )
+    return _mip_filtered(screen, settings.mip_px) if settings.mip_px > 0 else screen
+
+
+def _mip_filtered(screen: ScreenSplats, sigma: float) -> ScreenSplats:
+    """Apply the Mip filter of rule 24, ``sigma`` px (docs/math.md, "Mip filter")."""
+    # M (u, v) z_c is the pixel's offset from the projected centre, to first order.
+    (a, b), (c, d) = screen.Au[:, :2].unbind(dim=1), screen.Av[:, :2].unbind(dim=1)
+    s2 = (sigma * screen.Tw[:, 2] / (a * d - b * c)) ** 2  # inverse(M) inverse(M)^T = [[b^2 + d^2, ...]] / det(M)^2
+    g11, g12, g22 = 1 + s2 * (b * b + d * d), -s2 * (a * b + c * d), 1 + s2 * (a * a + c * c)
+    det = 1 + s2 * (a * a + b * b + c * c + d * d) + (sigma * screen.Tw[:, 2]) ** 2 * s2  # without cancellation
+    l11 = g11.sqrt()
+    l21, l22 = g12 / l11, det.sqrt() / l11
+
+    def widened(A: Tensor) -> Tensor:
+        return torch.stack([l11 * A[:, 0] + l21 * A[:, 1], l22 * A[:, 1], A[:, 2]], dim=1)
+
+    return replace(
+        screen,
+        Au=widened(screen.Au),
+        Av=widened(screen.Av),
+        Tw=widened(screen.Tw),
+        opacity=screen.opacity / (l11 * l22),
     )
 
 
@@ -169,7 +197,7 @@ def _boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: RasterSet
     for axis, A in enumerate((Au, Av)):
         b, a = _dot(k2, A, Tw) / safe, _dot(k2, A, A) / safe
         half = (b * b - a).clamp(min=0).sqrt()
-        disc = settings.lowpass_px * k2.sqrt()
+        disc = settings.clamp_px * k2.sqrt()
         low.append(center[:, axis] + torch.minimum(b - half, -disc))
         high.append(center[:, axis] + torch.maximum(b + half, disc))
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=d.device)
@@ -184,7 +212,7 @@ def _square_boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: Ra
     d = _dot(k2, Tw, Tw)
     middle = torch.stack([_dot(k2, A, Tw) / d for A in (Au, Av)], dim=1)  # [M, 2]
     squares = middle.square() - torch.stack([_dot(k2, A, A) / d for A in (Au, Av)], dim=1)
-    half = squares.amax(dim=1).clamp(min=1e-4).sqrt().maximum(settings.lowpass_px * k2.sqrt())
+    half = squares.amax(dim=1).clamp(min=1e-4).sqrt().maximum(settings.clamp_px * k2.sqrt())
     middle = middle + center
     known = middle.abs().sum(dim=1) + half < 1e9  # not if the disc only touches the plane
     first = torch.where(known[:, None], middle - 0.5 - half.ceil()[:, None], 0.0)  # pixel centres at integers

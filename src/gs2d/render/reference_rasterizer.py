@@ -117,7 +117,7 @@ def evaluate_pairs(
         h_v = h_v - torch.cat([zero, zero, shift[..., 1:2]], dim=2)
     cross = torch.linalg.cross(h_u, h_v)  # (u, v, 1) up to scale: both planes contain the intersection
 
-    rho2d = (delta * delta).sum(dim=2) / settings.lowpass_px**2
+    rho2d = (delta * delta).sum(dim=2) / settings.clamp_px**2
     with torch.no_grad():  # branches have no gradient; comparisons with NaN are False, as required
         uv = cross[..., :2] / cross[..., 2:]
         z = (uv * screen.Tw[:, None, :2]).sum(dim=2) + screen.Tw[:, None, 2]

@@ -30,7 +30,16 @@ __all__ = ["CameraTensors", "Rasterization", "SplatTensors", "rasterize_2dgs"]
 COLORS = 3  # channels in ``sh0``
 MIN_SCALE = 1e-18  # world units; limit of the kernels: only the low-pass filter draws a smaller disc
 MIN_OPACITY, MAX_OPACITY = 1e-30, 1 - 2.0**-20  # limits with finite logits; splats below alpha_min are not drawn
-CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
+CONSTANTS = (
+    "near",
+    "far",
+    "alpha_min",
+    "alpha_max",
+    "transmittance_min",
+    "error_cutoff",
+    "lowpass_px",
+    "mip_px",
+)
 
 
 class Rasterization(NamedTuple):

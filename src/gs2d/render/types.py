@@ -11,6 +11,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 
 TRANSMITTANCE = "transmittance"  # the kind of depth that is only rendered on request
+NO_LOWPASS = 1e-3  # px; finite, because kernels divide by its square
 PLAIN_COLORS = -1  # value of RasterSettings.sh_degree
 NEAR_PLANE_POLICIES = ("draw", "cull", "box")  # values of near_plane_policy; the kernels use their index
 # Rule 23: splats beyond these limits are culled, since float32 would overflow (core/project.h has the same).
@@ -18,6 +19,9 @@ MAX_SIZE = 1e9  # world units: coordinates in the camera frame, scales
 MIN_SIZE = 1e-18  # world units: smaller scales count as this
 MAX_COLOR = 1e15  # sum of the absolute coefficients of a colour
 MIN_QUATERNION = 1e-15  # largest component; below, it counts as a zero quaternion
+# Rule 24: a splat that the Mip filter would enlarge by more than this is culled (core/mip_filter.h has the same). With
+# an opacity of at most 1e-4 it would not be visible, and edge-on splats have no finite factor.
+MAX_WIDENING = 1e4
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,10 @@ class RasterSettings:
     error_cutoff : float
         Footprint of ``splat_errors``: rho <= error_cutoff^2.
     lowpass_px : float
-        px. Standard deviation of the screen-space low-pass filter.
+        px. Standard deviation of the screen-space low-pass filter of 2DGS.
+    mip_px : float
+        px. Standard deviation of the object-space Mip filter, which then replaces that low-pass filter (rule 24). 0: the
+        low-pass filter.
     background : tuple of 3 floats
         Background colour in [0, 1]; with ``PLAIN_COLORS`` any finite numbers.
     sh_degree : int
@@ -64,6 +71,7 @@ class RasterSettings:
     transmittance_min: float = 1e-4
     error_cutoff: float = 3.0
     lowpass_px: float = math.sqrt(2.0) / 2.0
+    mip_px: float = 0.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = 3
     lowpass_depth: str = "center"
@@ -79,6 +87,11 @@ class RasterSettings:
     def facts(self) -> dict[str, Any]:
         """Return the constants by name, for files, without ``with_transmittance_depth``, which losses determine."""
         return {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("derived")}
+
+    @property
+    def clamp_px(self) -> float:
+        """Standard deviation of the low-pass filter, px; with a Mip filter so small that it covers no pixel centre."""
+        return self.lowpass_px if self.mip_px == 0 else NO_LOWPASS
 
     def depth_width(self, camera: Camera) -> float:
         """Return kappa of rule 22: the half width as a fraction of the depth."""

@@ -32,8 +32,8 @@ from gs2d.training.step_result import StepResult
 from gs2d.training.targets import Target, TargetSource, is_async
 
 
-def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
-    """Return the rasterizer settings for a scene of this extent (world units) under a protocol."""
+def raster_settings(protocol: Protocol, extent: float, sh_degree: int, mip_px: float = 0.0) -> RasterSettings:
+    """Return the rasterizer settings for a scene of this extent (world units) under a protocol; ``mip_px`` as in Recipe."""
     near = protocol.near_for(extent)
     # far only scales the distortion; in a large frame it keeps its default ratio to near.
     far = max(RasterSettings.far, near * RasterSettings.far / RasterSettings.near)
@@ -43,6 +43,7 @@ def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> Raster
         background=protocol.background,
         sh_degree=sh_degree,
         near_plane_policy=protocol.near_plane_policy,
+        mip_px=mip_px,
     ).for_depths(protocol.depth, protocol.fused_depth)
 
 
@@ -126,7 +127,7 @@ class FullRender:
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
         active = [term for term in stage.losses if term.is_active(iteration)]
         settings = replace(
-            raster_settings(self.protocol, self.scene.extent, degree),
+            raster_settings(self.protocol, self.scene.extent, degree, self.recipe.mip_px),
             background=background or self.protocol.background,
             with_distortion=bool(self.losses.needing("distortion", active)),
             with_transmittance_depth=False,

@@ -193,7 +193,7 @@ class Trainer:
     @property
     def settings(self) -> RasterSettings:
         """The rasterizer's constants at the full SH degree, for evaluation and fusion."""
-        return raster_settings(self.protocol, self.scene.extent, self.recipe.sh_degree)
+        return raster_settings(self.protocol, self.scene.extent, self.recipe.sh_degree, self.recipe.mip_px)
 
     def scene_now(self) -> Scene:
         """Return the scene with the learned quantities of its images and cameras."""

@@ -132,7 +132,7 @@ class PartitionTask(BlocksTask):
             splats,
             with_learned_appearance(coarse, settled.recipe, settled.scene),
             self.partition(),
-            raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree),
+            raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree, settled.recipe.mip_px),
             settled.backend,
             partition_folder(out),
             on_event,

@@ -49,7 +49,7 @@ template <class T> struct Buffer {
 struct View {
     double R[9], t[3], center[3];  // x_cam = R x + t; camera centre in the world
     double fx, fy, cx, cy;
-    double near, far, alpha_min, alpha_max, transmittance_min, error_cutoff, lowpass_px;
+    double near, far, alpha_min, alpha_max, transmittance_min, error_cutoff, lowpass_px, mip_px;
     double background[3];
     // exact_masks = 0 disables culling inside tiles, including splats without an ellipse (tests)
     int32_t width, height, sh_degree, exact_masks;

@@ -1,4 +1,5 @@
 // Projection of all splats: records, cull records, tile rectangles, radii.
+#include "core/mip_filter.h"
 #include "cpu/frame.h"
 #include "cpu/splat_group.h"
 #include "cpu/threads.h"
@@ -20,6 +21,11 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     g.frame = frame_of(g.parameters, f.camera);
     g.record = project(g.parameters, g.frame, f.camera);
     g.alive = in_range(g.parameters, g.frame) & (g.frame.p.z > V(real(f.view.near))) & first(lanes);
+    if (f.view.mip_px > 0) {
+        const MipFilter<V> filter = mip_filter(g.record, V(real(f.view.mip_px)));
+        widen(filter, g.frame, g.record);
+        g.alive = g.alive & filter.in_range();
+    }
     if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
     return g;
 }
@@ -170,11 +176,13 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
                 zero_rows(intrinsics, i, 4, lanes);
             continue;
         }
-        const RecordGradient<V> gr = {g[0],  g[1],  g[2],  g[3],  g[4],  g[5],  g[6], g[7], g[8], g[9],
-                                      g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
+        RecordGradient<V> gr = {g[0],  g[1],  g[2],  g[3],  g[4],  g[5],  g[6], g[7], g[8], g[9],
+                                g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
         const SplatParameters<V> p = load_parameters(s, i, lanes);
         const Frame3<V> frame = frame_of(p, f.camera);
         const Record<V> r = project(p, frame, f.camera);
+        const bool filters = f.view.mip_px > 0;
+        const Probe<V> filtered = filters ? widen_vjp(r, V(real(f.view.mip_px)), gr) : Probe<V>{};
 
         V sh[3 * SH_MAX], basis[SH_MAX], along[SH_MAX];
         const int degree = f.view.sh_degree;
@@ -191,8 +199,9 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
         write_sh(degree, s.sh_rest, out, i, lanes, g_color, basis);
         if (!wants_geometry(out) && !intrinsics) continue;
 
-        const ParameterGradient<V> d =
+        ParameterGradient<V> d =
             project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
+        if (filters) d.probe_x = filtered.x, d.probe_y = filtered.y;
         const auto write = [&]<int K>(real* to, V(&values)[K]) {
             if (!to) return;
             for (V& v : values) v = keep(seen, v);

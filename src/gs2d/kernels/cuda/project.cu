@@ -1,4 +1,5 @@
 // Projection of all splats: activations, SH colour, record, cull record, tile rectangle, depth key, radius.
+#include "core/mip_filter.h"
 #include "cuda/colors.h"
 
 namespace gs2d {
@@ -44,9 +45,14 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     a.depth_keys[i] = 0x7f800000, a.tile_counts[i] = 0, a.radii[i] = 0.f;
 
     const SplatParameters<float> p = load_parameters(a, i);
-    const Frame3<float> frame = frame_of(p, v.camera);
+    Frame3<float> frame = frame_of(p, v.camera);
     Record<float> r = project(p, frame, v.camera);
     if (!in_range(p, frame) || !(frame.p.z > v.near)) return;
+    if (v.mip_px > 0.f) {
+        const MipFilter<float> filter = mip_filter(r, v.mip_px);
+        if (!filter.in_range()) return;
+        widen(filter, frame, r);
+    }
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
     const bool crossing = v.near_plane_policy != NEAR_PLANE_DRAW && reaches_camera_plane(frame, v.error_k2);
     if (crossing && v.near_plane_policy == NEAR_PLANE_CULL) return;

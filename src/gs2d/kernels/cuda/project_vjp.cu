@@ -2,6 +2,7 @@
 //
 // Rows of SH and of three floats pass through shared memory (rows.h): they are three quarters of the 464 bytes per
 // splat that this kernel reads and writes. Therefore no lane of a warp may exit early.
+#include "core/mip_filter.h"
 #include "cuda/colors.h"
 #include "cuda/rows.h"
 
@@ -105,9 +106,12 @@ extern "C" __global__ void __launch_bounds__(128, PROJECT_VJP_BLOCKS) project_sp
         const Frame3<float> frame = frame_of(p, a.view.camera);
         const Record<float> r = project(p, frame, a.view.camera);
         const float4 g0 = g[0], g1 = g[1], g2 = g[2], g3 = g[3], e = row_of_4(a.extras, i);
-        const RecordGradient<float> gr = {g0.x, g0.y, g0.z, g0.w, g1.x, g1.y, g1.z, g1.w, g2.x, g2.y,
-                                          g2.z, g2.w, g3.x, g3.y, g3.z, g3.w, e.x,  e.y,  e.z,  e.w};
+        RecordGradient<float> gr = {g0.x, g0.y, g0.z, g0.w, g1.x, g1.y, g1.z, g1.w, g2.x, g2.y,
+                                    g2.z, g2.w, g3.x, g3.y, g3.z, g3.w, e.x,  e.y,  e.z,  e.w};
+        const bool filters = a.view.mip_px > 0.f;
+        const Probe<float> filtered = filters ? widen_vjp(r, a.view.mip_px, gr) : Probe<float>{};
         d = project_vjp(p, frame, r, gr, g_direction, a.view.camera);
+        if (filters) d.probe_x = filtered.x, d.probe_y = filtered.y;
         if (a.g_intrinsics) intrinsics = intrinsics_vjp(frame, r, gr, a.view.camera);
         abs_x = gr.abs_x, abs_y = gr.abs_y;
         if (a.clears) {

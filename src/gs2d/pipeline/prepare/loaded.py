@@ -168,7 +168,7 @@ def prepare_run(
         protocol=capture.protocol,
         scene=CaptureRecord.of(capture.scene, with_priors(digest, capture.scene, recipe, on_event)),
         downscale=capture.downscale,
-        raster=raster_settings(capture.protocol, capture.scene.extent, recipe.sh_degree),
+        raster=raster_settings(capture.protocol, capture.scene.extent, recipe.sh_degree, recipe.mip_px),
         backend=capture.backend.facts(),
         stage2_cache_bytes=options.stage2_cache_mb << 20,
         schedule_scale=scale,

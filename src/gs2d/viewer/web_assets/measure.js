@@ -42,7 +42,7 @@ function surfaceAt(x, y) {
   const across = [(px - s * camera.cx) / (s * camera.fx), (py - s * camera.cy) / (s * camera.fy)];
   const ray = plus(plus(times(camera.right, across[0]), camera.down, across[1]), camera.ahead); // depth 1
   const square = dot(ray, ray), means = new Float32Array(records.buffer), hits = [];
-  const blur = (4 * facts.lowpass) / (s * Math.min(camera.fx, camera.fy)); // relative to the depth: a splat is at least this wide
+  const blur = (4 * (facts.lowpass + facts.mip)) / (s * Math.min(camera.fx, camera.fy)); // relative to the depth: a splat is at least this wide
   for (let i = 0; i < facts.splats; ++i) {
     const rel = [means[8 * i] - camera.eye[0], means[8 * i + 1] - camera.eye[1], means[8 * i + 2] - camera.eye[2]];
     const z = dot(rel, camera.ahead), along = dot(rel, ray);
@@ -59,15 +59,27 @@ function surfaceAt(x, y) {
   return null;
 }
 
+function mipFilter(scales, tu, tv, rel, z, s) {
+  // The factor L of rule 24, from the map M of (u, v) to px: L L^T = 1 + mip^2 inverse(M) inverse(M)^T.
+  const shift = (axis, f, t, scale) => (s * f * scale * (dot(t, axis) - (dot(rel, axis) / z) * dot(t, camera.ahead))) / z;
+  const [a, b] = [tu, tv].map((t, i) => shift(camera.right, camera.fx, t, scales[i]));
+  const [c, d] = [tu, tv].map((t, i) => shift(camera.down, camera.fy, t, scales[i])), s2 = (facts.mip / (a * d - b * c)) ** 2;
+  if (!facts.mip || !Number.isFinite(s2)) return { l11: 1, l21: 0, l22: 1 };
+  const l11 = Math.sqrt(1 + s2 * (b * b + d * d)), squares = a * a + b * b + c * c + d * d;
+  const det = 1 + s2 * (squares + facts.mip ** 2);
+  return { l11, l21: (-s2 * (a * b + c * d)) / l11, l22: Math.sqrt(det) / l11 };
+}
+
 function intersection({ scales, opacity, tu, tv }, rel, z, ray, across, s) {
   // Depth and alpha of a splat on a ray, as in splat.frag. Splats that cross the camera's plane do not count.
   const tilt = (scales[0] * dot(tu, camera.ahead)) ** 2 + (scales[1] * dot(tv, camera.ahead)) ** 2;
   if (facts.crossingCutoff ** 2 * tilt >= z * z) return [z, 0];
   const n = cross(tu, tv), onPlane = dot(n, rel) / dot(n, ray), offset = plus(times(ray, onPlane), rel, -1);
-  const flat = onPlane > 0 ? (dot(offset, tu) / scales[0]) ** 2 + (dot(offset, tv) / scales[1]) ** 2 : Infinity;
+  const { l11, l21, l22 } = mipFilter(scales, tu, tv, rel, z, s), u = dot(offset, tu) / scales[0] / l11;
+  const v = (dot(offset, tv) / scales[1] - l21 * u) / l22, flat = onPlane > 0 ? u * u + v * v : Infinity;
   const dx = s * camera.fx * (across[0] - dot(rel, camera.right) / z), dy = s * camera.fy * (across[1] - dot(rel, camera.down) / z);
   const round = (dx * dx + dy * dy) / facts.lowpass ** 2, depth = flat <= round ? onPlane : z;
-  const alpha = opacity * Math.exp(-0.5 * Math.min(flat, round));
+  const alpha = (opacity / (l11 * l22)) * Math.exp(-0.5 * Math.min(flat, round));
   return [depth, depth < facts.near || alpha < facts.alphaMin ? 0 : Math.min(alpha, facts.alphaMax)];
 }
 

@@ -10,7 +10,7 @@ uniform mat3 R;                    // world to camera
 uniform vec3 t, eye;               // x_cam = R x + t; the camera centre
 uniform vec4 intrinsics;           // fx, fy, cx, cy, px
 uniform vec2 size;                 // of the image, px
-uniform float near, alphaMin, lowpass, crossingCutoff;
+uniform float near, alphaMin, lowpass, mip, crossingCutoff;  // lowpass, mip: px
 uniform int degree, texels;        // SH degree; texels of SH coefficients per splat
 uniform int nearPlanePolicy;       // 0 draw, 1 cull, 2 box
 uniform int kind;                  // 0 colours, 1 normals, 2 depth
@@ -84,6 +84,23 @@ void main() {
     vec3 tv = R * vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x));
     vec3 n = cross(tu, tv), a = s.x * tu, b = s.y * tv;
     center = intrinsics.xy * p.xy / p.z + intrinsics.zw;
+    float facing = dot(n, p), least = 1e-7 * length(p);
+    float inverse = 1.0 / (abs(facing) >= least ? facing : facing < 0.0 ? -least : least);
+    vec2 f = 1.0 / intrinsics.xy;
+    planes = inverse * vec4(f * cross(tv, p).xy / s.x, f * cross(p, tu).xy / s.y);
+    inverseDepth = vec3(f * inverse * n.xy, 1.0 / p.z);
+    if (mip > 0.0) {  // kernels/core/mip_filter.h
+        float variance = mip * mip * p.z * p.z, area = variance * (planes.x * planes.w - planes.y * planes.z);
+        float uu = dot(planes.xy, planes.xy), vv = dot(planes.zw, planes.zw), l11 = sqrt(1.0 + variance * uu);
+        float l21 = variance * dot(planes.xy, planes.zw) / l11;
+        float l22 = sqrt(1.0 + variance * (uu + vv) + area * area) / l11;
+        planes.xy /= l11;
+        planes.zw = (planes.zw - l21 * planes.xy) / l22;
+        opacity /= l11 * l22;
+        a = l11 * a + l21 * b;
+        b *= l22;
+        if (!(opacity >= alphaMin)) return;
+    }
 
     float kk = 2.0 * log(opacity / alphaMin), k = sqrt(kk);
     vec2 depths = vec2(a.z, b.z);
@@ -111,11 +128,6 @@ void main() {
     opacity *= 1.0 - cropped * hidden;
     if (any(greaterThanEqual(low, high)) || opacity < alphaMin) return;
 
-    float facing = dot(n, p), least = 1e-7 * length(p);
-    float inverse = 1.0 / (abs(facing) >= least ? facing : facing < 0.0 ? -least : least);
-    vec2 f = 1.0 / intrinsics.xy;
-    planes = inverse * vec4(f * cross(tv, p).xy / s.x, f * cross(p, tu).xy / s.y);
-    inverseDepth = vec3(f * inverse * n.xy, 1.0 / p.z);
 
     vec3 toSplat = mean - eye;
     if (kind == 1) {

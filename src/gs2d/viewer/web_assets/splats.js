@@ -214,7 +214,7 @@ function prepareSplats() {
   gl.useProgram(program);
   gl.uniform1i(at.splats, 0);
   gl.uniform1i(at.harmonics, 1);
-  for (const name of ["near", "alphaMin", "alphaMax", "lowpass", "crossingCutoff"]) gl.uniform1f(at[name], facts[name]);
+  for (const name of ["near", "alphaMin", "alphaMax", "lowpass", "mip", "crossingCutoff"]) gl.uniform1f(at[name], facts[name]);
   gl.uniform1i(at.nearPlanePolicy, facts.nearPlanePolicy);
   gl.useProgram(finalProgram.program);
   gl.uniform3f(finalProgram.at.background, ...facts.background);
