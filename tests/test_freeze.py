@@ -40,7 +40,7 @@ LIMITS = {
     "options by name": 76,
     "settings by name": 24,
     "recipes": 23,
-    "fields of recipes": 103,
+    "fields of recipes": 104,
 }
 
 

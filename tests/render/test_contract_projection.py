@@ -282,7 +282,11 @@ def test_24_the_filtered_opacity_culls_and_so_does_a_filter_that_is_too_wide(bac
     # 0.005 px counts in splat errors, whose footprint does not depend on the opacity; a factor of 2501; 0.0005 px: 250,001.
     image = torch.zeros(9, 9, 3)
     errors = [
-        float(splat_errors(splat(scales=(s, s)), front_camera(), image, replace(settings, mip_px=0.25), backend=backend)[0])
+        float(
+            splat_errors(splat(scales=(s, s)), front_camera(), image, replace(settings, mip_px=0.25), backend=backend)[
+                0
+            ]
+        )
         for s in (0.001, 0.0001)
     ]
     assert errors[0] > 0

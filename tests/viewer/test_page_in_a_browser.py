@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -266,23 +267,35 @@ def test_keys_open_help_show_normals_and_depth_and_step_through_photographs(page
     still(page)
 
 
-def test_the_view_of_a_photograph_matches_the_rasterizer(page: Page) -> None:
+def set_mip_filter(page: Page, sigma: float) -> None:
+    facts = replace(SETTINGS, mip_px=sigma)
+    page.ask(f"Object.assign(facts, {{mip: {sigma}, lowpass: {facts.clamp_px}}}); gl.useProgram(splatProgram.program);"
+             "for (const name of ['mip', 'lowpass']) gl.uniform1f(splatProgram.at[name], facts[name])")  # fmt: skip
+
+
+@pytest.mark.parametrize("mip_px", [0.0, 5.0])
+def test_the_view_of_a_photograph_matches_the_rasterizer(page: Page, mip_px: float) -> None:
+    set_mip_filter(page, mip_px)
     page.drag((320, 160), (380, 170))
     page.size(WIDTH, HEIGHT)
     try:
         page.ask("document.body.classList.add('bare'); goTo(3)")
         still(page)
         page.until("drawn === wanted")
+        settings = replace(SETTINGS, mip_px=mip_px)
         with torch.no_grad():
-            ours = rasterize(two_balls(), ONE_SIDE[3].camera, SETTINGS, backend="reference").color.numpy()
+            ours = rasterize(two_balls(), ONE_SIDE[3].camera, settings, backend="reference").color.numpy()
         error = ((page.image() - np.clip(ours, 0, 1)) ** 2).mean()
         assert -10 * np.log10(error) > 48
     finally:
+        set_mip_filter(page, 0.0)
         page.ask("document.body.classList.remove('bare')")
         page.size(640, 420)
 
 
-def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
+@pytest.mark.parametrize("mip_px", [0.0, 3.0])
+def test_two_clicks_measure_a_distance_on_the_surface(page: Page, mip_px: float) -> None:
+    set_mip_filter(page, mip_px)
     page.key("m")
     place = "JSON.stringify([[0, 0.3, 0], [0, -0.3, 0]].map(onScreen).map((p) => [p.x, p.y]))"
     red, green = json.loads(page.ask(place))
@@ -300,6 +313,7 @@ def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
     np.testing.assert_allclose([float(word) for word in words[4:]], [100, -199.7, 50, 100, -200.3, 50, 1.25], atol=3e-3)
     page.key("Escape")
     assert values(page, "ruler.on", "$('measurepanel').hidden") == [False, True]
+    set_mip_filter(page, 0.0)
 
 
 def test_splats_without_cameras_open_with_nearly_all_of_them_in_the_window(tmp_path: Path) -> None:
