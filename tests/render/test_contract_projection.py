@@ -260,7 +260,7 @@ def test_24_the_mip_filter_widens_a_splat_and_keeps_its_integral(backend: Backen
 
 
 def test_24_the_mip_filter_keeps_the_plane_and_replaces_the_low_pass_filter(backend: Backend) -> None:
-    # Rotated 45 degrees about y, s_u = 0.02: 0.0707 px along x, 0.1 px along y. Pixel (5, 4) hits u = 12.86, z = 2 / 1.1.
+    # Rotated 45 degrees about y: 0.0707 px along x, 0.1 px along y. Pixel (5, 4) hits u = 12.86, z = 2 / 1.1.
     scene = splat(scales=(0.02, 0.02), opacity=0.9, axis=Y_AXIS, degrees=45)
     settings = RasterSettings(mip_px=0.3, alpha_min=1e-4)
     l11, l22 = sqrt(1 + 0.3**2 / 0.005), sqrt(1 + 0.3**2 / 0.01)
@@ -279,15 +279,10 @@ def test_24_the_filtered_opacity_culls_and_so_does_a_filter_that_is_too_wide(bac
     ]
     equal(alphas[0][4, 4], 0.5 / 101)
     equal(alphas[1], torch.zeros(9, 9))
-    # 0.005 px counts in splat errors, whose footprint does not depend on the opacity; a factor of 2501; 0.0005 px: 250,001.
+    # In splat errors the opacity culls nothing: 0.005 px is enlarged by 2501 and counts, 0.0005 px by 250,001.
     image = torch.zeros(9, 9, 3)
-    errors = [
-        float(
-            splat_errors(splat(scales=(s, s)), front_camera(), image, replace(settings, mip_px=0.25), backend=backend)[
-                0
-            ]
-        )
-        for s in (0.001, 0.0001)
-    ]
+    settings = RasterSettings(mip_px=0.25)
+    scene = stack(*(splat(scales=(size, size)) for size in (0.001, 0.0001)))
+    errors = splat_errors(scene, front_camera(), image, settings, backend=backend)
     assert errors[0] > 0
-    assert errors[1] == 0.0
+    assert errors[1] == 0

@@ -11,7 +11,8 @@ opacity o and colour c. A *pair* is a splat and a pixel. k^2 = 2 ln(o / alpha_mi
  3. *Intersection.* The ray of the pixel intersects the splat's plane at p + u s_u t_u + v s_v t_v, at depth z along
     the optical axis; rho3d = u^2 + v^2. If the ray is parallel to the plane or the intersection has z <= 0, there is
     no hit and rho3d is infinite.
- 4. *Low-pass filter* (see 24). rho2d = |pixel - c|^2 / lowpass_px^2, where c is the projection of p; rho = min(rho3d, rho2d).
+ 4. *Low-pass filter*, unless there is a Mip filter (24). rho2d = |pixel - c|^2 / lowpass_px^2, where c is the
+    projection of p; rho = min(rho3d, rho2d).
     If rho3d <= rho2d, the pair's depth is z. Otherwise it is z_c (``lowpass_depth="center"``), or z (``"plane"``,
     reference only; z_c without a hit).
  5. *Near.* A splat with z_c <= near is culled; a pair with depth < near is skipped. Splats that cross the near plane

@@ -145,7 +145,7 @@ def _mip_filtered(screen: ScreenSplats, sigma: float) -> ScreenSplats:
     # M (u, v) z_c is the pixel's offset from the projected centre, to first order.
     (a, b), (c, d) = screen.Au[:, :2].unbind(dim=1), screen.Av[:, :2].unbind(dim=1)
     s2 = (sigma * screen.Tw[:, 2] / (a * d - b * c)) ** 2  # inverse(M) inverse(M)^T = [[b^2 + d^2, ...]] / det(M)^2
-    g11, g12, g22 = 1 + s2 * (b * b + d * d), -s2 * (a * b + c * d), 1 + s2 * (a * a + c * c)
+    g11, g12 = 1 + s2 * (b * b + d * d), -s2 * (a * b + c * d)
     det = 1 + s2 * (a * a + b * b + c * c + d * d) + (sigma * screen.Tw[:, 2]) ** 2 * s2  # without cancellation
     l11 = g11.sqrt()
     l21, l22 = g12 / l11, det.sqrt() / l11

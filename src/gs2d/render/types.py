@@ -43,8 +43,8 @@ class RasterSettings:
     lowpass_px : float
         px. Standard deviation of the screen-space low-pass filter of 2DGS.
     mip_px : float
-        px. Standard deviation of the object-space Mip filter, which then replaces that low-pass filter (rule 24). 0: the
-        low-pass filter.
+        px. Standard deviation of the object-space Mip filter, which then replaces that low-pass filter (rule 24). 0:
+        the low-pass filter.
     background : tuple of 3 floats
         Background colour in [0, 1]; with ``PLAIN_COLORS`` any finite numbers.
     sh_degree : int

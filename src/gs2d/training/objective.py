@@ -33,7 +33,7 @@ from gs2d.training.targets import Target, TargetSource, is_async
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int, mip_px: float = 0.0) -> RasterSettings:
-    """Return the rasterizer settings for a scene of this extent (world units) under a protocol; ``mip_px`` as in Recipe."""
+    """Return the rasterizer settings for a scene of this extent (world units); ``mip_px`` is that of the recipe."""
     near = protocol.near_for(extent)
     # far only scales the distortion; in a large frame it keeps its default ratio to near.
     far = max(RasterSettings.far, near * RasterSettings.far / RasterSettings.near)
