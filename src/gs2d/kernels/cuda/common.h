@@ -23,10 +23,10 @@ struct View {
     float error_k2;          // error_cutoff^2
     float distortion_scale;  // (far near / (far - near))^2
     float inv_depth_width;   // for rule 22
-    float mip_px;            // rule 24; 0: no Mip filter
     float background[3];
     int width, height, tiles_x, tiles_y;
     int sh_degree, near_plane_policy;
+    float mip_px;  // rule 24; 0: no Mip filter
 };
 
 __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {

@@ -69,9 +69,10 @@ class KernelView(ctypes.Structure):
         ("center", ctypes.c_float * 3),
         *_all(ctypes.c_float, "fx", "fy", "cx", "cy"),
         *_all(ctypes.c_float, "near", "lowpass_px", "inv_lowpass2", "log2_alpha_min", "alpha_max", "transmittance_min"),
-        *_all(ctypes.c_float, "error_k2", "distortion_scale", "inv_depth_width", "mip_px"),
+        *_all(ctypes.c_float, "error_k2", "distortion_scale", "inv_depth_width"),
         ("background", ctypes.c_float * 3),
         *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y", "sh_degree", "near_plane_policy"),
+        ("mip_px", ctypes.c_float),
     )
 
 
