@@ -11,12 +11,16 @@ import numpy as np
 import pytest
 
 from gs2d.config import grades
+from gs2d.config.grades import GOOD, USABLE
 from gs2d.core.json_files import write_json
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.finish.run_verdict import Finding, Measures, ViewMeasures, judge
+from gs2d.pipeline.finish.run_verdict import Finding, Measures, ViewMeasures, judge, spread_pixels
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
 from gs2d.report.run_record import RunRecord
 from gs2d.report.sections.verdict_section import verdict_section
+from render_scenes import front_camera, splat, stack
 
 
 def views(train: float = 29.0, test: float = 27.0, **changes: Any) -> tuple[ViewMeasures, ...]:
@@ -98,6 +102,23 @@ def test_a_bad_view_is_reported_with_advice(change: dict[str, Any], name: str, g
     assert text in f"{finding.figure} {finding.text} {finding.advice}"
     assert finding.views == ("t3.jpg",)
     assert finding.advice
+
+
+def test_a_surface_that_is_unclear_in_many_pixels_is_reported_and_never_poor() -> None:
+    """A veil at alpha 0.3 before a wall: the image is right, but the two depths differ."""
+    wall, veil = splat((0, 0, 4), scales=(4, 4), opacity=0.99), splat((0, 0, 2), scales=(4, 4), opacity=0.3)
+    settings = RasterSettings().for_depths("transmittance")
+    spreads = [
+        spread_pixels(rasterize(scene, front_camera(), settings, backend="cpu")) for scene in (wall, stack(wall, veil))
+    ]
+    assert spreads == [0.0, 1.0]
+    assert spread_pixels(rasterize(wall, front_camera(), backend="cpu")) is None
+    for spread, grade in ((0.14, GOOD), (0.3, USABLE), (1.0, USABLE)):
+        verdict = judge(Measures(tuple(replace(view, spread=spread) for view in views())))
+        assert verdict.grade == grade
+        assert [f.figure for f in verdict.findings if f.name == "surface"] == (
+            [] if grade == GOOD else [f"{100 * spread:.0f} % unclear"]
+        )
 
 
 def test_photographs_without_a_camera_are_reported_and_many_get_advice() -> None:

@@ -25,6 +25,7 @@ from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
 from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.open_capture import placed_photographs
+from gs2d.render.types import RenderOutput
 
 FORMAT = 3
 NAMED = 3  # views named in a sentence; verdict.json has all
@@ -36,6 +37,8 @@ HEADLINES: Mapping[str | None, str] = {
 }
 UNCHECKED = "The training photographs are reproduced {}; new views were not checked."
 NOT_MEASURED = "not measured"
+OPAQUE = 0.5  # alpha; above, a pixel shows a surface
+SPREAD_DEPTH = 0.05  # of the mean depth; the depth that hides a sparse point (evaluation/hidden_points.py)
 
 
 # -- measures ----------------------------------------------------------------------------------------------------------
@@ -50,6 +53,8 @@ class ViewMeasures:
         dB, of 8-bit images.
     points, hidden : int or None
         Sparse points visible in a test view, and how many of them its rendering hides.
+    spread : float or None
+        Share of the opaque pixels along which the splats lie at different depths (:func:`spread_pixels`).
     """
 
     name: str
@@ -57,6 +62,7 @@ class ViewMeasures:
     psnr: float | None = None
     points: int | None = None
     hidden: int | None = None
+    spread: float | None = None
 
 
 @dataclass(frozen=True)
@@ -108,12 +114,26 @@ class Collector:
 
     def _measure(self, seen: RenderedPhotograph, scores: ImageMetrics) -> ViewMeasures:
         view, psnr = seen.view, scores.psnr.value
-        measured = ViewMeasures(view.name, seen.split, psnr if psnr is not None and math.isfinite(psnr) else None)
+        psnr = psnr if psnr is not None and math.isfinite(psnr) else None
+        measured = ViewMeasures(view.name, seen.split, psnr, spread=spread_pixels(seen.output))
         if seen.split != "test" or self._observed is None:
             return measured
         points = self._observed.in_view(view.name, view.camera)
         hidden = hidden_points(seen.output.depth("median").cpu().numpy(), points).hidden
         return replace(measured, points=len(points.depth), hidden=hidden)
+
+
+def spread_pixels(output: RenderOutput) -> float | None:
+    """Return the share of opaque pixels whose surface is unclear; None without the transmittance depth.
+
+    There the depths of half transmittance and of the mean differ by more than ``SPREAD_DEPTH``: part of the splats is
+    not on the surface, as in a faint veil in front of it. The image can be right, but the mesh tears.
+    """
+    if output.depth_transmittance is None:
+        return None
+    opaque = output.alpha > OPAQUE
+    mean, half = output.depth_mean[opaque], output.depth_transmittance[opaque]
+    return float(((half - mean).abs() > SPREAD_DEPTH * mean).double().mean()) if len(mean) else None
 
 
 # -- judging -----------------------------------------------------------------------------------------------------------
@@ -139,9 +159,9 @@ class Verdict:
 
 
 def judge(measures: Measures) -> Verdict:
-    """Return the verdict: the worse grade of image quality and floaters."""
+    """Return the verdict: the worst grade of image quality, floaters and surface."""
     quality = _quality(measures)
-    findings = (*quality, _floaters(measures), *_placed(measures))
+    findings = (*quality, _floaters(measures), *_surface(measures), *_placed(measures))
     graded = any(finding.grade is not None for finding in quality)
     grade = grades.worst([f.grade for f in findings if f.grade is not None]) if graded else None
     headline = HEADLINES[grade]
@@ -200,6 +220,19 @@ def _floaters(measures: Measures) -> Finding:
     advice = "" if grade == GOOD else f"Take more photographs near {_some(views)}, in the same light."
     text = "Sparse points of new views that the rendering hides behind floaters or a misplaced surface."
     return Finding("floaters", grade, f"{100 * hidden / shown:.1f} % of {shown:,} points", text, advice, views)
+
+
+def _surface(measures: Measures) -> list[Finding]:
+    """Report a surface that is unclear in many pixels; nothing if it is clear or was not measured."""
+    shares = {view.name: view.spread for view in measures.views if view.spread is not None}
+    part = fmean(shares.values()) if shares else 0.0
+    grade = grades.SPREAD.grade(part)
+    if grade == GOOD:
+        return []
+    views = tuple(sorted(shares, key=lambda name: -shares[name]))[:NAMED]
+    text = "Pixels in which splats lie in front of the surface or behind it, so that the mesh can tear."
+    advice = f"Look at mesh.ply near {_some(views)}; if it is torn, train with another --seed or longer."
+    return [Finding("surface", grade, f"{100 * part:.0f} % unclear", text, advice, views)]
 
 
 def _placed(measures: Measures) -> list[Finding]:
