@@ -18,7 +18,16 @@ import gs2d
 
 FACE = (
     *("load_scene", "train", "Trainer", "Recipe", "Stage", "get_recipe", "list_recipes", "compute_losses"),
-    *("rasterize", "rasterize_2dgs", "splat_errors", "read_splats", "write_splats", "extract_mesh", "evaluate"),
+    *(
+        "rasterize",
+        "rasterize_2dgs",
+        "splat_errors",
+        "splat_sums",
+        "read_splats",
+        "write_splats",
+        "extract_mesh",
+        "evaluate",
+    ),
     *("Camera", "Splats", "Scene", "Mesh", "MeshOptions", "TrainOptions", "Protocol", "LossTerm"),
     *(
         "register_loss",

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from gs2d.meshing.mesh_methods import register_mesh_method
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
     from gs2d.pipeline.prepare.options import MeshOptions, Training, TrainOptions
-    from gs2d.render.api import rasterize, splat_errors
+    from gs2d.render.api import rasterize, splat_errors, splat_sums
     from gs2d.render.backends import backend_report, get_backend, register_backend
     from gs2d.render.tensor_api import CameraTensors, SplatTensors, rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
@@ -100,6 +100,7 @@ __all__ = [
     "register_splat_reader",
     "rgb_to_sh0",
     "splat_errors",
+    "splat_sums",
     "train",
     "write_mesh",
     "write_splats",
@@ -159,6 +160,7 @@ _HOME = {
     "register_splat_reader": "gs2d.io.formats.splat_formats",
     "rgb_to_sh0": "gs2d.core.sh",
     "splat_errors": "gs2d.render.api",
+    "splat_sums": "gs2d.render.api",
     "train": "gs2d.pipeline.in_memory",
     "write_mesh": "gs2d.io.meshes",
     "write_splats": "gs2d.io.formats.splat_formats",

@@ -99,7 +99,7 @@ from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import attach_pose_grad, with_world_normals
 from gs2d.render.types import MAX_COLOR, NEAR_PLANE_POLICIES, PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
-__all__ = ["rasterize", "rasterize_features", "splat_errors"]
+__all__ = ["rasterize", "rasterize_features", "splat_errors", "splat_sums"]
 
 
 def rasterize(
@@ -278,6 +278,69 @@ def splat_errors(
     if image.dtype != splats.dtype:
         raise ShapeError(f"image must be {splats.dtype} like the splats, in [0, 1], got {image.dtype}")
     return chosen.splat_errors(splats, camera, image, settings, mask, occlusion)
+
+
+def splat_sums(
+    splats: Splats,
+    camera: Camera,
+    values: Tensor,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
+    *,
+    backend: str | Backend = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Sum the values of pixels for each splat, weighted as the splat is blended into the pixel.
+
+    The weight of a splat in a pixel is w of rule 7, the factor of its colour. A blended image is linear
+    in the colours, so these sums are the gradient of its scalar product with ``values``: one pass forward and back.
+    Divided by the weights, they are the mean of what a splat shows: labels or features of images lifted to splats.
+
+    Parameters
+    ----------
+    splats, camera, settings, backend
+        As for :func:`rasterize`; ``sh_degree`` and ``background`` are ignored.
+    values : Tensor [H, W, D]
+        Finite values of any sign, with dtype and device of the splats.
+
+    Returns
+    -------
+    sums : Tensor [N, D]
+        Sum of weight times value; no gradient.
+    weights : Tensor [N]
+        Sum of the weights, px; 0 for splats that no pixel shows.
+
+    Raises
+    ------
+    ShapeError, BackendError
+        As for :func:`rasterize`.
+
+    Examples
+    --------
+    >>> sums, weights = gs2d.splat_sums(splats, camera, features)  # doctest: +SKIP
+    >>> lifted = sums / weights.clamp(min=1e-6)[:, None]  # doctest: +SKIP
+    """
+    check_dense("values", values)
+    check_shapes({"values": (values, f"{camera.height} {camera.width} _")})
+    if (values.dtype, values.device) != (splats.dtype, splats.device) or not bool(values.isfinite().all()):
+        raise ShapeError(
+            f"values must be finite {splats.dtype} on {splats.device} like the splats, got {values.dtype} on "
+            f"{values.device}{'' if bool(values.isfinite().all()) else ' with NaN or infinity'}"
+        )
+    chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
+    settings = replace(settings, sh_degree=PLAIN_COLORS, background=(0.0, 0.0, 0.0), with_distortion=False)
+    camera = replace(camera, pose=None, intrinsics=None)  # the result has no gradient
+    ones = torch.ones_like(values[..., :1])
+    target = torch.cat([values.detach(), *[ones] * max(3 - values.shape[-1], 1)], dim=2)  # [H, W, 3 or more]
+    with torch.enable_grad():
+        colors = torch.zeros((len(splats), target.shape[-1]), dtype=splats.dtype, device=splats.device)
+        colors.requires_grad_()
+        plain = replace(splats.detach(), sh0=colors[:, None, :3], shN=splats.shN.detach()[:, :0])
+        features = Features(colors[:, 3:], torch.zeros_like(target[0, 0, 3:]))
+        if target.shape[-1] == 3:
+            image = rasterize(plain, camera, settings, backend=chosen).color
+        else:
+            image = rasterize_features(plain, camera, settings, features, backend=chosen).color
+        (sums,) = torch.autograd.grad(image, colors, grad_outputs=target)
+    return sums[:, : values.shape[-1]], sums[:, values.shape[-1]]
 
 
 def check_dense(name: str, tensor: object) -> None:
