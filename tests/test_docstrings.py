@@ -13,7 +13,6 @@ from typing import Any
 
 import gs2d
 from gs2d.cli.command_line import NAMES, options_of
-from gs2d.config.multiview import MultiView
 from gs2d.config.presets import get_recipe
 from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES
@@ -112,7 +111,6 @@ def test_set_paths_in_messages_exist_in_a_recipe_with_other_stage_names() -> Non
         base,
         stages=(replace(base.stages[0], name="mine"),),
         learned=(EXPOSURE, POSES, INTRINSICS),
-        multiview=MultiView(),
         depth_prior=DepthPrior(),
         normal_prior=NormalPrior(),
     )

@@ -39,8 +39,8 @@ LIMITS = {
     "options of all commands": 306,
     "options by name": 76,
     "settings by name": 24,
-    "recipes": 23,
-    "fields of recipes": 104,
+    "recipes": 22,
+    "fields of recipes": 93,
 }
 
 

@@ -186,7 +186,7 @@ def test_files_on_the_pages_exist() -> None:
 
 
 def test_recipe_fields_on_the_pages_exist() -> None:
-    recipes = [RECIPES[name]() for name in ("best", "2dgs-r", "2dgs-multiview")]
+    recipes = [RECIPES[name]() for name in ("best", "2dgs-r")]
     recipes.append(with_robustness(with_intrinsics(with_exposure(with_normal_prior(with_depth_prior(recipes[0]))))))
     wrong = []
     for page in USER_PAGES:

@@ -8,7 +8,6 @@ import pytest
 
 from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
 from gs2d.config.densify import Densify
-from gs2d.config.multiview import MultiView
 from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.quantities import EXPOSURE, POSES
 from gs2d.config.recipe import (
@@ -133,7 +132,6 @@ def test_validate_names_the_stage_and_the_field(recipe: Recipe, message: str) ->
 
 MOVING = replace(one(), stages=(Stage("s", 1, train={"means": "all"}, losses=L1),))
 WHOLE = {  # valid recipes with the part that is changed
-    "multiview": replace(one(losses=(*L1, LossTerm("multiview_photometric", 0.1))), multiview=MultiView()),
     "depth_prior": replace(one(losses=(*L1, LossTerm("depth_prior", 0.1))), depth_prior=DepthPrior()),
 }
 
@@ -141,17 +139,6 @@ WHOLE = {  # valid recipes with the part that is changed
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        ("multiview.patches", 0),
-        ("multiview.patches", 10**11),
-        ("multiview.radius", 1.5),
-        ("multiview.radius", 1000),
-        ("multiview.depth_downscale", 0),
-        ("multiview.depth_downscale", 32),
-        ("multiview.texture", 0.0),
-        ("multiview.opacity", 1.0),
-        ("multiview.occluded", float("inf")),
-        ("multiview.max_angle", 120.0),
-        ("multiview.min_baseline", 1.0),
         ("depth_prior.source", "lidar"),
         ("depth_prior.final_factor", 0.0),
         ("depth_prior.decay_steps", 0),

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-import two_views
 from emulate import Emulator
-from gs2d.config.multiview import MultiView
 from gs2d.core.splats import Splats
 from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.cuda.cuda_adam import AdamUpdate, adam_step
-from gs2d.kernels.cuda.cuda_multiview import compare_views
 from gs2d.kernels.native_losses import NormalOptions
 from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.cuda_step import Stepper
@@ -100,12 +96,7 @@ def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
         total.backward()
         results = {"value": total.detach(), "x": x.grad, "depth": depth.grad, "alpha": alpha.grad}
         found |= {f"losses {size}.{name}": value for name, value in results.items() if value is not None}
-    pair = two_views.scenario(settings=MultiView(patches=61, radius=3, texture=0.03, occluded=4.0), masked=True)
-    leaves = pair.depth.requires_grad_(), pair.normal.requires_grad_(), torch.zeros(6, requires_grad=True)
-    both = sum(pair.views(*leaves).compared(partial(compare_views, launcher=emulator)))
-    assert isinstance(both, Tensor)
-    both.backward()
-    return found | {f"two views.{k}": leaf.grad for k, leaf in enumerate(leaves) if leaf.grad is not None}
+    return found
 
 
 def steps(emulator: Emulator) -> dict[str, Tensor]:

@@ -33,7 +33,7 @@ from gs2d.training.parallel import OneProcess, Turn
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
 from gs2d.training.trainer import Trainer
-from train_toys import backends, compared, grouped, make_scene, short
+from train_toys import backends, grouped, make_scene, short
 from wall_scene import wall
 
 
@@ -97,8 +97,8 @@ def cached() -> Recipe:
 
 
 def dropping() -> Recipe:
-    """Return a recipe with splat dropout and multi-view losses."""
-    return replace(compared(), removal=Removal(decay=0.0, dropout=0.3))
+    """Return a recipe with splat dropout."""
+    return replace(short(), removal=Removal(decay=0.0, dropout=0.3))
 
 
 def robust() -> Recipe:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.config.multiview import MultiView
-from gs2d.config.presets import appearance, refine, surface, with_multiview
+from gs2d.config.presets import appearance, refine, surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import GradDensify, LearningRates, Recipe
 from gs2d.core.camera import look_at
@@ -111,19 +110,6 @@ def short(absgs: bool = False) -> Recipe:
             replace(refine(), iterations=5),
         ),
     )
-
-
-WIDE = MultiView(
-    patches=40, radius=1, texture=0.001, opacity=0.02, occluded=50.0, neighbours=2, max_angle=75.0, max_baseline=2.0
-)
-
-
-def compared() -> Recipe:
-    """Return ``short`` with both multi-view losses, active in stage 1 after its second-last densification."""
-    recipe = with_multiview(short(), 0.15, 0.03)
-    first = recipe.stages[0]
-    losses = tuple(replace(t, start=6) if t.kind.startswith("multiview") else t for t in first.losses)
-    return replace(recipe, stages=(replace(first, losses=losses), *recipe.stages[1:]), multiview=WIDE)
 
 
 def backends() -> list[str]:

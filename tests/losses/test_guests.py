@@ -143,19 +143,6 @@ def test_a_loss_gets_the_silhouette_and_the_distortion_that_it_needs(
         assert output.distortion.isfinite().all()
 
 
-def test_a_loss_gets_the_neighbour_that_it_needs() -> None:
-    recipe, given = with_guest(replace(train_toys.short(), multiview=train_toys.WIDE), needs=["neighbour"])
-    train_toys.train(train_toys.make_scene(), recipe)
-    assert given
-    assert all(view.neighbour is not None for _, view in given)
-
-
-def test_a_loss_of_two_views_needs_a_recipe_that_compares_views() -> None:
-    recipe, _ = with_guest(train_toys.short(), needs=["neighbour"])
-    with pytest.raises(RecipeError, match="multiview is null, but loss 'kept' needs it; set"):
-        train_toys.train(train_toys.make_scene(), recipe)
-
-
 @pytest.mark.parametrize("needs", [["depth"], "silhouette"])
 def test_an_unknown_need_is_refused(needs: Sequence[str]) -> None:
     with pytest.raises(RecipeError, match="needs of loss 'kept' must be a list of silhouette, flatness"):

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gs2d.config.loss_registry import LOSSES
-from gs2d.config.multiview import MultiView
 from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.recipe import LossTerm, Recipe, Stage
 from gs2d.core.camera import Camera
@@ -18,7 +17,6 @@ from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.losses import formulas as reference
 from gs2d.losses.base import Losses, LossView, compute_losses, losses_of, target_mean
 from gs2d.losses.prior_formulas import MetricDepth, NormalTarget
-from gs2d.losses.view_pair import Neighbour, prepare_image
 from gs2d.render.types import RenderOutput
 from loss_images import make_camera, make_output
 
@@ -42,10 +40,10 @@ def one_loss(
     depth: str = "mean",
     backend: str = "reference",
 ) -> Tensor:
-    """Return a loss of weight 1; the silhouette is the target's first channel, the second view a shifted target."""
-    terms, neighbour = [LossTerm(kind, 1.0)], one_neighbour(target, mask, camera)
+    """Return a loss of weight 1; the silhouette is the first channel of the target."""
+    terms = [LossTerm(kind, 1.0)]
     of_image = {"silhouette": target[..., 0], "flatness": (255 * target[..., 1]).to(torch.uint8)}
-    view = LossView(target, camera, mask, index=0, depth_kind=depth, neighbour=neighbour, **of_image)
+    view = LossView(target, camera, mask, index=0, depth_kind=depth, **of_image)
     losses = Losses(terms)
     if kind in PRIORS:
         losses[terms[0]]._priors = OnePrior(target)  # type: ignore[attr-defined]
@@ -62,16 +60,6 @@ class OnePrior:
 
     def at(self, *_: object) -> tuple[MetricDepth, NormalTarget]:
         return self._known
-
-
-def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:
-    """Return the same image from a camera shifted to the right, with all patches of 3 px sampled and no occlusion."""
-    settings = MultiView(patches=target.shape[0] * target.shape[1], radius=1, texture=1e-3, opacity=0.01, occluded=1e3)
-    image, aside = prepare_image(target, mask, settings), camera.T_cam_world.copy()
-    aside[0, 3] -= 0.1
-    depth = torch.full_like(target[..., 0], 1.5)
-    draws = torch.full((settings.patches,), 0.5)
-    return Neighbour(image, image, replace(camera, T_cam_world=aside), depth, draws, settings)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -124,7 +112,7 @@ def test_a_view_without_valid_pixels_has_loss_zero_except_for_the_constant_of_ss
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if "multiview" not in kind])  # test_multiview.py
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked: bool) -> None:
     height, width = 6, 7
     output, camera = make_output(height, width, seed=1), make_camera(width, height)
@@ -295,18 +283,11 @@ def test_each_loss_checks_its_options(term: LossTerm, words: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", ["depth_prior", "normal_prior", "multiview_geometric"])
+@pytest.mark.parametrize("kind", ["depth_prior", "normal_prior"])
 def test_a_loss_and_its_settings_are_required_together(kind: str) -> None:
-    name = "multiview" if "multiview" in kind else kind
-    settings = {"multiview": MultiView(), "depth_prior": DepthPrior(), "normal_prior": NormalPrior()}
-    with pytest.raises(RecipeError, match=f"{name} is null, but loss '{kind}' needs it"):
+    settings = {"depth_prior": DepthPrior(), "normal_prior": NormalPrior()}
+    with pytest.raises(RecipeError, match=f"{kind} is null, but loss '{kind}' needs it"):
         losses_of(trained_with(LossTerm(kind, 0.1)))
-    with pytest.raises(RecipeError, match=f"{name} is set, but no loss uses it"):
-        losses_of(trained_with(**{name: settings[name]}))
-    assert losses_of(trained_with(LossTerm(kind, 0.1), **{name: settings[name]}))
-
-
-def test_losses_between_views_use_one_depth() -> None:
-    pair = (LossTerm("multiview_photometric", 1.0, depth="median"), LossTerm("multiview_geometric", 1.0))
-    with pytest.raises(RecipeError, match="must use the same depth, got median and the protocol's"):
-        losses_of(trained_with(*pair, multiview=MultiView()))
+    with pytest.raises(RecipeError, match=f"{kind} is set, but no loss uses it"):
+        losses_of(trained_with(**{kind: settings[kind]}))
+    assert losses_of(trained_with(LossTerm(kind, 0.1), **{kind: settings[kind]}))

@@ -14,7 +14,7 @@ from gs2d.config.recipe import Recipe
 from gs2d.core.splats import Splats
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from train_toys import backends, compared, grouped, make_scene, random_splats, short
+from train_toys import backends, grouped, make_scene, random_splats, short
 
 SCENE = make_scene()
 
@@ -36,12 +36,12 @@ def test_trained_splats_get_the_same_gradients_beside_frozen_ones(backend: str) 
     whole = random_splats(40)
     own, frozen = whole.rows(torch.arange(25)), whole.rows(torch.arange(25, 40))
     apart, together = (
-        trainer_of(compared(), splats, others, backend) for splats, others in ((own, frozen), (whole, None))
+        trainer_of(short(), splats, others, backend) for splats, others in ((own, frozen), (whole, None))
     )
     for trainer in (apart, together):
         trainer.enter(0)
-        trainer.state.step = 7  # the multi-view losses are active
-    stage, found = compared().stages[0], []
+        trainer.state.step = 7
+    stage, found = short().stages[0], []
     for trainer in (apart, together):
         probe = torch.zeros(len(trainer.splats), 2, requires_grad=True)
         found.append(trainer._whole.evaluate(trainer.state, stage, 8, 1, probe))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import get_recipe, surface, with_intrinsics, with_multiview
+from gs2d.config.presets import get_recipe, surface, with_intrinsics
 from gs2d.config.protocols import GENERIC
 from gs2d.config.quantities import INTRINSICS, POSES
 from gs2d.config.recipe import LearningRates, LossTerm, Recipe, validate
@@ -124,8 +124,6 @@ def test_invalid_intrinsics_recipes_are_refused() -> None:
     validate(recipe)
     with pytest.raises(RecipeError, match="intrinsics need poses in learned, got none"):
         validate(replace(recipe, learned=(INTRINSICS,)))
-    with pytest.raises(RecipeError, match="intrinsics cannot be learned with multiview"):
-        validate(with_multiview(recipe, 0.6, 0.04))
     with pytest.raises(RecipeError, match=r"intrinsics\.rate must be in \(0, 1\], got 0"):
         validate(recipe.with_learned(replace(INTRINSICS, rate=0.0)))
 

@@ -12,11 +12,10 @@ MODULES = {
     "gs2d.losses.view_terms": (
         *("l1", "ssim", "l2", "normal_consistency", "normal_consistency_per_splat", "normal_smoothness"),
         *("distortion", "silhouette"),
-        *("multiview_photometric", "multiview_geometric"),
     ),
     "gs2d.losses.prior_terms": ("depth_prior", "normal_prior"),
 }
-NEEDS = ("silhouette", "flatness", "distortion", "neighbour")
+NEEDS = ("silhouette", "flatness", "distortion")
 """Inputs of losses that are computed or loaded only on request."""
 LOSSES: Registry[Any] = Registry(
     "loss",
@@ -36,9 +35,7 @@ def register_loss(name: str, *, needs: Sequence[str] = ()) -> Callable[[Register
         Kind of the loss; must not be taken.
     needs : sequence of str
         Inputs that are computed or loaded only on request: "silhouette" (``view.silhouette``, the alpha channel of the
-        image), "flatness" (``view.flatness``, where the image has no texture), "distortion" (``output.distortion``) or
-        "neighbour" (``view.neighbour``, in recipes with ``multiview``, with the depth of the first term that names
-        one).
+        image), "flatness" (``view.flatness``, where the image has no texture) or "distortion" (``output.distortion``).
 
     Returns
     -------

@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any
 
 from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
-from gs2d.config.multiview import MultiView
 from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES
 from gs2d.config.recipe import (
@@ -35,7 +34,6 @@ from gs2d.errors import RecipeError
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
 SH_PATIENCE = 3  # factor of the iterations for each SH degree if exposures are learned
 NC_START, DISTORTION_START = 7_000, 3_000  # official
-MULTIVIEW_WEIGHT = 0.3  # docs/notebook/multiview.md
 DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/notebook/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, which its rates are chosen for
@@ -134,26 +132,6 @@ def with_exposure(recipe: Recipe) -> Recipe:
     stages = (replace(stage, sh_interval=SH_PATIENCE * stage.sh_interval) for stage in recipe.stages)
     learning = recipe.with_learned(EXPOSURE)
     return replace(learning, name=f"{recipe.name}-exposure", stages=tuple(stages))
-
-
-def with_multiview(
-    recipe: Recipe, photometric: float = MULTIVIEW_WEIGHT, geometric: float = 0.0, *, name: str | None = None
-) -> Recipe:
-    """Return the recipe with losses between two views, in stages with normal consistency, after densification.
-
-    Not in the paper. Reasons for the weights, which differ from those of PGSR, and for the start:
-    docs/notebook/multiview.md.
-    """
-
-    def extended(stage: Stage) -> Stage:
-        starts = [term.start for term in stage.losses if term.kind == "normal_consistency" and term.weight]
-        start = max([*starts, 0 if stage.densify is None else stage.densify.stop])
-        weights = {"multiview_photometric": photometric, "multiview_geometric": geometric} if starts else {}
-        terms = (LossTerm(kind, weight, start) for kind, weight in weights.items() if weight > 0)
-        return replace(stage, losses=(*stage.losses, *terms))
-
-    stages = tuple(extended(stage) for stage in recipe.stages)
-    return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=MultiView())
 
 
 def with_depth_prior(recipe: Recipe, source: str = "auto", weight: float = DEPTH_WEIGHT) -> Recipe:
@@ -335,8 +313,6 @@ def _registry() -> dict[str, NamedRecipe]:
     add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
     add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
     add("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
-    about = "2dgs with multi-view losses, for better surfaces of textured objects"
-    add("2dgs-multiview", about, partial(with_multiview, two_dgs()))
     return entries
 
 

@@ -16,7 +16,6 @@ from typing import Any
 from gs2d.config.actions import Action
 from gs2d.config.densify import Densify
 from gs2d.config.loss_registry import LOSSES
-from gs2d.config.multiview import MultiView, check_multiview
 from gs2d.config.prior_settings import DepthPrior, NormalPrior, check_priors
 from gs2d.config.quantities import QUANTITIES, Quantity
 from gs2d.config.robust import DenseStart, Removal, check_robust
@@ -38,9 +37,8 @@ class LossTerm:
         "l1", "ssim" (1 - SSIM), "l2" (mean squared difference), "normal_consistency", "normal_consistency_per_splat"
         (the paper's Eq. 7), "normal_smoothness" (where images have no texture), "distortion" or "silhouette" (alpha
         compared with that of the images). In recipes with
-        ``multiview``: "multiview_photometric" (1 - NCC of warped patches) and "multiview_geometric" (round trip, px);
-        with ``depth_prior``: "depth_prior" (relative error of depth); with ``normal_prior``: "normal_prior"
-        (1 - cosine). Or a registered loss (docs/extending.md).
+        ``depth_prior``: "depth_prior" (relative error of depth); with ``normal_prior``: "normal_prior" (1 - cosine).
+        Or a registered loss (docs/extending.md).
     weight : float or None
         None: the weight of the protocol (Table 1 of the paper: 100/10 for "distortion").
     start : int
@@ -293,8 +291,6 @@ class Recipe:
         Number of random points that training starts from if the scene has no sparse points.
     learned : tuple of Quantity
         Quantities of images and cameras that are learned with the splats, each at most once.
-    multiview : MultiView or None
-        Settings of the multi-view losses.
     depth_prior, normal_prior : DepthPrior, NormalPrior or None
         Settings of the losses on known depths and normals.
     dense_start : DenseStart or None
@@ -320,7 +316,6 @@ class Recipe:
     sh_degree: int = 3
     init_points: int = 100_000
     learned: tuple[Quantity, ...] = ()
-    multiview: MultiView | None = None
     depth_prior: DepthPrior | None = None
     normal_prior: NormalPrior | None = None
     dense_start: DenseStart | None = None
@@ -407,10 +402,6 @@ def validate(recipe: Recipe) -> Recipe:
         require(moves, f"{where}: poses need a stage that trains the means of all splats, got none")
     if "intrinsics" in learned:
         require("poses" in learned, f"{where}: intrinsics need poses in learned, got none; add them")
-        fixed = "it compares views by the intrinsics of the capture"
-        require(recipe.multiview is None, f"{where}: intrinsics cannot be learned with multiview: {fixed}; remove one")
-    if recipe.multiview is not None:
-        check_multiview(f"{where}: multiview", recipe.multiview)
     check_priors(where, recipe.depth_prior, recipe.normal_prior)
     if recipe.fused_depth is not None:
         one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)

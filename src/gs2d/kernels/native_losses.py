@@ -40,8 +40,6 @@ class LossOperations:
     photometric, normal_consistency, normal_smoothness, masked_mean : callable
     blur : callable or None
         Computes the local mean of the target for ``photometric``; None: caching it does not save time.
-    compare_views : callable or None
-        ``kernels.native_multiview.compare_views``; None: torch computes the losses of two views.
     """
 
     photometric: Callable[..., tuple[Tensor, Tensor, Tensor]]
@@ -49,7 +47,6 @@ class LossOperations:
     normal_smoothness: Callable[..., Tensor]
     masked_mean: Callable[..., Tensor]
     blur: Callable[[Tensor], Tensor] | None = None
-    compare_views: Callable[..., tuple[Tensor, Tensor]] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,6 @@ from gs2d.errors import RecipeError, ShapeError
 from gs2d.kernels.native_losses import LossOperations
 from gs2d.losses import formulas
 from gs2d.losses.formulas import normals_from_depth
-from gs2d.losses.view_pair import Neighbour
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RenderOutput
 
@@ -46,7 +45,7 @@ __all__ = [
     "target_mean",
 ]
 
-SETTINGS = ("multiview", "depth_prior", "normal_prior")
+SETTINGS = ("depth_prior", "normal_prior")
 """Fields of a recipe that only losses use."""
 
 
@@ -87,8 +86,6 @@ class LossView:
         Alpha of the image, in [0, 1], if it has an alpha channel and an active loss needs it.
     flatness : Tensor [H, W] uint8 or None
         ``formulas.flatness`` of the image, if an active loss needs it.
-    neighbour : Neighbour or None
-        The second view, for losses that need it.
     target_mean : Tensor [H, W, 3] or None
         Result of :func:`target_mean` for ``target``. It saves the native SSIM one blur of four, without changing a
         value.
@@ -107,7 +104,6 @@ class LossView:
     depth_kind: str = "mean"
     silhouette: Tensor | None = None
     flatness: Tensor | None = None
-    neighbour: Neighbour | None = None
     target_mean: Tensor | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
     shared: dict[object, Any] = field(default_factory=dict)
@@ -156,7 +152,7 @@ class Loss:
         Entries of ``gs2d.config.loss_registry.NEEDS``: inputs that are computed or loaded only on request. A class
         sets them by ``register_loss(name, needs=...)``; an object may change its own by its options.
     settings : str or None
-        Field of the recipe that must be set for this loss: "multiview", "depth_prior" or "normal_prior".
+        Field of the recipe that must be set for this loss: "depth_prior" or "normal_prior".
     only_color : bool
         Whether the loss reads nothing of the rendering but ``color``. Stages that only train colours can then render
         from cached views.
@@ -290,20 +286,13 @@ def losses_of(recipe: Recipe) -> Losses:
     losses, where = Losses(term for stage in recipe.stages for term in stage.losses), f"recipe {recipe.name!r}"
     used = set()
     for kind, loss in losses:
-        name = "multiview" if "neighbour" in loss.needs else loss.settings
+        name = loss.settings
         used.add(name)
         if name is not None and getattr(recipe, name) is None:
             raise RecipeError(f"{where}: {name} is null, but loss {kind!r} needs it; set {name} or leave the loss out")
     for name in SETTINGS:
         if getattr(recipe, name) is not None and name not in used:
             raise RecipeError(f"{where}: {name} is set, but no loss uses it; set {name}=null or add such a loss")
-    for stage in recipe.stages:
-        kinds = {term.depth or "the protocol's" for term in losses.needing("neighbour", stage.losses)}
-        if len(kinds) > 1:
-            raise RecipeError(
-                f"stage {stage.name!r}: all losses between views must use the same depth, got "
-                f"{' and '.join(sorted(kinds))}"
-            )
     return losses
 
 

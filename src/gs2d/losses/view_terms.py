@@ -1,6 +1,6 @@
-"""The losses of gs2d on one or two views: options, reference form and fused form of each.
+"""The losses of gs2d on one view: options, reference form and fused form of each.
 
-The reference forms are the formulas of ``losses.formulas`` and ``losses.view_pair``. Definitions: ``docs/math.md``.
+The reference forms are the formulas of ``losses.formulas``. Definitions: ``docs/math.md``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from gs2d.config.recipe import LossTerm
 from gs2d.config.validate import one_of, require
 from gs2d.errors import RecipeError
 from gs2d.kernels.native_losses import LossOperations, NormalOptions
-from gs2d.losses import formulas, view_pair
+from gs2d.losses import formulas
 from gs2d.losses.base import Loss, LossView
 from gs2d.losses.formulas import EDGES
-from gs2d.losses.view_pair import ViewPair
 from gs2d.render.pose_gradient import normals_without_pose_grad
 from gs2d.render.types import RenderOutput
 from gs2d.render.whole_step import StepNormals
@@ -230,52 +229,3 @@ class SilhouetteLoss(Loss):
         if opaque:
             return None if self._required else {}
         return {"silhouette": float(term.weight or 0.0)}
-
-
-class _TwoViews(Loss):
-    """Base class of losses between a view and its neighbour. A backend may compute both by one operation."""
-
-    index: int
-
-    def _pair(self, output: RenderOutput, view: LossView) -> ViewPair:
-        """Return the view and its neighbour, shared by the losses of one kind of depth."""
-        if view.neighbour is None:
-            raise RecipeError("losses of two views need a neighbour, got none; pass one or use a recipe without them")
-        neighbour, depth = view.neighbour, output.depth(view.depth_kind)
-
-        def pair() -> ViewPair:
-            hit = (output.alpha.detach() > neighbour.settings.opacity) & (depth.detach() > 0)
-            candidates = hit & neighbour.reference.textured
-            return ViewPair(depth, output.normal, candidates, view.camera, neighbour, view.mask)
-
-        made: ViewPair = view.once(("pair", view.depth_kind), pair)
-        return made
-
-    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor | None:
-        """Return the loss by the operation of the backend, if it has one."""
-        compare = operations.compare_views
-        if compare is None:
-            return self(output, view)
-        pair = self._pair(output, view)
-        value: Tensor = view.once(("compared", view.depth_kind), lambda: pair.compared(compare))[self.index]
-        return value
-
-
-@register_loss("multiview_photometric", needs=["neighbour"])
-class MultiviewPhotometric(_TwoViews):
-    """1 - NCC of patches that the surface warps into the neighbour."""
-
-    index = 0
-
-    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
-        return view_pair.photometric(self._pair(output, view))
-
-
-@register_loss("multiview_geometric", needs=["neighbour"])
-class MultiviewGeometric(_TwoViews):
-    """Distance in px between pixels and their round trip through the neighbour's depth."""
-
-    index = 1
-
-    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
-        return view_pair.geometric(self._pair(output, view))

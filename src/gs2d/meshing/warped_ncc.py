@@ -32,7 +32,7 @@ from gs2d.kernels.native_refine import (
 )
 from gs2d.meshing.raycast import NEAR, cast_camera, outlines
 
-MIN_SCALE = 0.1  # depth in the neighbour / depth in the view; as in kernels/core/multiview.h
+MIN_SCALE = 0.1  # depth in the neighbour / depth in the view; as in kernels/cpu/refine.cpp
 OUTLINE = 2  # px on both sides of an outline that are ignored
 ENOUGH = 0.5  # fraction of a window that must be visible in both images
 

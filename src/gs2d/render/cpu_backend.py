@@ -14,7 +14,6 @@ from gs2d.errors import BackendError
 from gs2d.kernels import densify_stats, library, native_adam, native_losses
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.native_losses import LossOperations
-from gs2d.kernels.native_multiview import compare_views
 from gs2d.kernels.tsdf import FusionOnHost
 from gs2d.render import cpu_cached
 from gs2d.render.backends import Backend, BackendStatus, register_backend
@@ -89,7 +88,6 @@ class CpuBackend(Backend):
             native_losses.normal_smoothness,
             native_losses.masked_mean,
             native_losses.blur,
-            compare_views,
         )
 
     def fusion(self) -> FusionOnHost:

@@ -13,7 +13,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.kernels import torch_kernels
-from gs2d.kernels.cuda import cuda_adam, cuda_losses, cuda_multiview, diagnose, launch
+from gs2d.kernels.cuda import cuda_adam, cuda_losses, diagnose, launch
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.native_losses import LossOperations
 from gs2d.kernels.tsdf import FusionOnDevice
@@ -102,7 +102,6 @@ class CudaBackend(Backend):
             partial(cuda_losses.normal_consistency, launcher=launcher),
             partial(cuda_losses.normal_smoothness, launcher=launcher),
             partial(cuda_losses.masked_mean, launcher=launcher),
-            compare_views=partial(cuda_multiview.compare_views, launcher=launcher),
         )
 
     def fusion(self) -> FusionOnDevice:

@@ -17,14 +17,12 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
 from gs2d.losses.base import LossReport, LossView, compute_losses, losses_of
-from gs2d.losses.view_pair import Neighbour
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.learned.appearance import shown, shown_splats
 from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity
 from gs2d.training.learned.quantity import ImagePoints
-from gs2d.training.neighbours import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours
 from gs2d.training.robust.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.robust.opaque import another_background
 from gs2d.training.state import TrainState
@@ -69,14 +67,12 @@ class Rendered:
     output : RenderOutput
     leaves : mapping of attribute to Tensor
         Tensors that ``output`` was rendered from.
-    neighbour : Neighbour or None
     """
 
     index: int
     camera: Camera
     output: RenderOutput
     leaves: Mapping[str, Tensor]
-    neighbour: Neighbour | None = None
 
 
 class Objective(Interface):
@@ -114,10 +110,6 @@ class FullRender:
         self.targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
         self.losses = losses_of(recipe)
-        if recipe.multiview is not None:
-            self._neighbours = find_neighbours(scene, recipe.multiview)
-            limit = 0 if scene.ahead else PATCH_BYTES
-            self._images = ImageFiles(scene.train, recipe.multiview, limit_bytes=limit)
         self.losses.prepare(scene, recipe, torch.device(backend.device))
 
     def settings(
@@ -170,9 +162,7 @@ class FullRender:
         if self.frozen is not None and probe is not None:
             of_all = torch.cat([probe, probe.new_zeros(len(self.frozen), probe.shape[1])])
         output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)
-        neighbour = self.neighbour_of(state, stage, iteration, index, splats)
-        rendered = Rendered(index, camera, output, dict(leaves.items()), neighbour)
-        found = self.differentiate(state, stage, iteration, rendered)
+        found = self.differentiate(state, stage, iteration, Rendered(index, camera, output, dict(leaves.items())))
         signal = None if probe is None else _gradient(probe)
         return replace(found, signal=signal, radii=output.radii[: len(splats)])
 
@@ -199,25 +189,6 @@ class FullRender:
     def _points(self, camera: Camera, target: Target) -> ImagePoints:
         """Return the pixels of a training image."""
         return ImagePoints(camera, target.silhouette, None if target.silhouette is None else self._background)
-
-    @torch.no_grad()
-    def neighbour_of(
-        self, state: TrainState, stage: Stage, iteration: int, index: int, splats: Splats
-    ) -> Neighbour | None:
-        """Return the neighbour that view ``index`` is compared with in an iteration, rendered; None without one."""
-        settings, terms = self.recipe.multiview, self.losses.needing("neighbour", stage.losses)
-        if settings is None or not any(term.weight and term.is_active(iteration) for term in terms):
-            return None
-        turn = draw_turn(self.recipe, state.stage, iteration, self._neighbours[index], settings)
-        if turn is None:
-            return None
-        camera, other = self.camera(state, turn.neighbour), turn.neighbour
-        kind = next((term.depth for term in terms if term.depth), self.protocol.depth)
-        bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False).for_depths(kind)
-        small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
-        depth = rasterize(self.drawn(splats), small, bare, backend=self.backend).depth(kind)
-        here, there = (self._images.of(i, self.targets[i]) for i in (index, other))
-        return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 
     @torch.no_grad()
     def report(
@@ -250,8 +221,7 @@ class FullRender:
             If a loss or a gradient is not finite. Not on a GPU, where reading a value waits for the device: there the
             trainer checks losses and parameters together, before anything is reported or saved.
         """
-        index, camera, output = rendered.index, rendered.camera, rendered.output
-        leaves, neighbour = rendered.leaves, rendered.neighbour
+        index, camera, output, leaves = rendered.index, rendered.camera, rendered.output, rendered.leaves
         target = self.targets[index]
         at = self._points(camera, target)
         numbers = self.learned.leaves(state.learned, index, camera, output.color)
@@ -267,13 +237,9 @@ class FullRender:
             depth_kind=self.protocol.depth,
             silhouette=target.silhouette,
             flatness=target.flatness,
-            neighbour=neighbour,
             target_mean=target.mean,
         )
         resolved = self.protocol.resolve(stage.losses)
-        if neighbour is None:
-            compared = self.losses.needing("neighbour", resolved)
-            resolved = tuple(term for term in resolved if term not in compared)
         terms = compute_losses(output, view, resolved, backend=self.backend, losses=self.losses)
         terms |= self.learned.penalties(numbers, index)
         loss = torch.stack(list(terms.values())).sum()

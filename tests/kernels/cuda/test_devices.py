@@ -64,7 +64,7 @@ backend.device = "cuda:0"
 # An iteration by kernels alone makes no tensors that could lie elsewhere.
 CudaBackend.takes_whole_steps = lambda self: False
 CudaBackend.for_training = lambda self: altered(self, _budget=cuda_budget.PairBudget())
-recipe, scene, generator = train_toys.compared(), train_toys.make_scene(), torch.Generator()
+recipe, scene, generator = train_toys.short(), train_toys.make_scene(), torch.Generator()
 start = initial_splats(scene, sh_degree=recipe.sh_degree, random_points=50, near=0.2, generator=generator)
 loop.validate = lambda recipe: recipe  # entry actions look at values: the groups that they write are made below
 loop.Trainer._check_parameters = lambda *_: None

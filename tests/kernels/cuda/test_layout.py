@@ -12,7 +12,6 @@ import re
 import pytest
 
 from gs2d.errors import BackendError
-from gs2d.kernels import native_multiview as multiview
 from gs2d.kernels import tsdf as fusion
 from gs2d.kernels.cuda import compile
 from gs2d.kernels.cuda import kernel_arguments as arguments
@@ -31,7 +30,7 @@ CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "c
 def structures() -> dict[str, type[ctypes.Structure]]:
     """Return the argument structures by name."""
     found = {}
-    for module in (arguments, fusion, multiview):
+    for module in (arguments, fusion):
         for name, value in vars(module).items():
             if isinstance(value, type) and issubclass(value, ctypes.Structure):
                 found[name.lstrip("_")] = value

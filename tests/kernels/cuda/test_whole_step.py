@@ -281,9 +281,7 @@ def test_learned_cameras_and_custom_densifiers_train_through_torch(
     assert OfItsOwn.seen == 5
 
 
-@pytest.mark.parametrize(
-    "case", ["object", "squares", "silhouettes", "compared later", "in the host's memory", "long lists"]
-)
+@pytest.mark.parametrize("case", ["object", "squares", "silhouettes", "in the host's memory", "long lists"])
 def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
     emulator: Emulator, scene: Scene, case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,8 +293,6 @@ def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
         recipe = with_squares(recipe)
     elif case == "silhouettes":
         recipe, given = with_silhouettes(of_object(recipe)), masked(scene)
-    elif case == "compared later":
-        recipe, count = brief(train_toys.compared()), 5  # active from the seventh iteration on
     elif case == "long lists":
         monkeypatch.setattr(cuda_works, "SHORTEST_PIECE", 8)  # lists from 16 entries on are cut
     else:

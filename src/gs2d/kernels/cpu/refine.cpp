@@ -8,12 +8,31 @@
 #include <cstdlib>
 #include <cstring>
 
-#include "core/multiview.h"
+#include "core/base.h"
 #include "cpu/export.h"
 #include "cpu/simd.h"
 #include "cpu/threads.h"
 
 namespace gs2d {
+
+constexpr double MIN_SCALE = 0.1;  // depth in the neighbour / depth in the view; points below are too close
+
+// Intrinsics of an image in px from the centre of its first pixel.
+struct Lens {
+    double fx, fy, cx, cy;
+};
+static Lens lens_of(const double* lens) { return {lens[0], lens[1], lens[2] - 0.5, lens[3] - 0.5}; }
+
+// An image interpolated between pixel centres, and its derivatives.
+struct Sampled {
+    double value, by_x, by_y;
+};
+// Bilinear interpolation at (x, y) in the unit square; a b is the upper row, c d the lower row.
+static Sampled between(double a, double b, double c, double d, double x, double y) {
+    const double right = b - a, bend = (d - c) - right;
+    const double by_x = fma(bend, y, right), by_y = fma(bend, x, c - a);
+    return {fma(y, by_y, fma(x, right, a)), by_x, by_y};
+}
 
 struct RasterArguments {
     int64_t vertices, faces, width, height;
@@ -117,7 +136,7 @@ enum Plane { WARPED, SLOPE, VISIBLE, BY_GREY, BY_WARPED, BY_ONE, BEND, PLANES };
 
 struct Neighbour {
     const MatchArguments& a;
-    const Lens<double> here = lens_of<double, double>(a.lens), there = lens_of<double, double>(a.source_lens);
+    const Lens here = lens_of(a.lens), there = lens_of(a.source_lens);
 
     // Writes a row of WARPED, SLOPE and VISIBLE.
     void warp(int64_t y, real* warped, real* slope, real* visible) const {
@@ -141,7 +160,7 @@ struct Neighbour {
             if (a.source_usable != nullptr && !a.source_usable[nearest]) continue;
             if (!sees(from, far)) continue;
             const real* const p = a.source + from;
-            const Sampled<double> s = between<double>(p[0], p[1], p[a.source_width], p[a.source_width + 1],
+            const Sampled s = between(p[0], p[1], p[a.source_width], p[a.source_width + 1],
                                                       px - double(i), py - double(j));
             warped[x] = real(s.value);
             slope[x] = real((s.by_x * there.fx * (dx - u * dz) + s.by_y * there.fy * (dy - v * dz)) * inverse);
@@ -284,7 +303,7 @@ GS2D_EXPORT int gs2d_match_views(const MatchArguments* arguments) {
 // Adds the derivatives of all pixels to the vertices of their faces, by the distance along `normals`.
 GS2D_EXPORT void gs2d_gather_vertices(const GatherArguments* arguments) {
     const GatherArguments& g = *arguments;
-    const Lens<double> lens = lens_of<double, double>(g.lens);
+    const Lens lens = lens_of(g.lens);
     for (int64_t y = 0; y < g.height; ++y) {
         for (int64_t x = 0; x < g.width; ++x) {
             const int64_t at = y * g.width + x;
