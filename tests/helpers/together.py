@@ -115,7 +115,6 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
     "robust": robust,
     "short": short,
     "absgs": lambda: short(absgs=True),
-    "compared": compared,
     "dropping": dropping,
     "learning": learning,
 }

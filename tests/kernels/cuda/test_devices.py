@@ -72,7 +72,7 @@ torch.Tensor.backward = lambda self: None  # torch's engine wants a real device:
 
 def quiet(stage):
     densify = stage.densify and replace(stage.densify, start=10**5, stop=10**6, reset_every=0, cap_every=0)
-    losses = tuple(replace(term, start=0) for term in stage.losses)  # two views are compared too
+    losses = tuple(replace(term, start=0) for term in stage.losses)
     return replace(stage, densify=densify, iterations=10**4, on_enter=(), losses=losses)
 
 recipe = replace(recipe, stages=tuple(quiet(stage) for stage in recipe.stages))
