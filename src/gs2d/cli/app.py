@@ -19,7 +19,6 @@ from dataclasses import replace
 from typing import NoReturn
 
 import gs2d
-from gs2d.cli import layout
 from gs2d.cli.command_line import NAMES
 from gs2d.cli.command_registry import COMMANDS
 from gs2d.cli.commands import (
@@ -162,10 +161,8 @@ def _fail(message: str) -> int:
 
 
 def _print_error(text: str) -> None:
-    """Print a line on stderr, wrapped between words on a terminal."""
-    is_terminal, text = sys.stderr is not None and sys.stderr.isatty(), printable(text)
-    for line in layout.message(text, layout.terminal_width()) if is_terminal else [text]:
-        print(line, file=sys.stderr)
+    """Print a line on stderr."""
+    print(printable(text), file=sys.stderr)
 
 
 def _print_traceback(error: BaseException) -> None:
@@ -203,11 +200,7 @@ def _report_missing(console: Console, argv: Sequence[str], command: Common) -> i
         if console.quiet:  # the reason was not printed
             line += f" ({event.reason})"
         again = _resumed(argv) if event.command is None else event.command
-        if again and sys.stderr is not None and sys.stderr.isatty():
-            _print_error(f"{line}; again:")
-            print(printable(again), file=sys.stderr)  # unwrapped, to be copied
-        else:
-            _print_error(f"{line}; again: {again}" if again else line)
+        _print_error(f"{line}; again: {again}" if again else line)
     return INCOMPLETE if console.missing else OK
 
 

@@ -16,7 +16,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from gs2d.cli.bar import Bar
-from gs2d.cli.layout import records, wrapped
 from gs2d.core.text import printable
 from gs2d.training.events import Event, Notice, NotMade, Phase, StageScored, Step
 
@@ -101,20 +100,11 @@ class Console:
                 soft_wrap=True,
             )
         elif isinstance(event, StageScored):
-            self._lines(wrapped(event.line(), self._err.width, rest="  "))
+            self._err.print(event.line(), markup=False, soft_wrap=True)
 
     def _note(self, notice: Notice) -> None:
-        """Print a notice; on a terminal its lines break between words."""
         label, style = ("warning", "bold red") if notice.is_warning else ("note", "yellow")
-        text, indent = printable(notice.text), len(label) + 1
-        first, *rest = wrapped(text, self._err.width - indent) if self._err.is_terminal else [text]
-        self._err.print(f"[{style}]{label}[/{style}] {escape(first)}", soft_wrap=True)
-        self._lines([" " * indent + line for line in rest])
-
-    def _lines(self, lines: Sequence[str]) -> None:
-        for line in lines if self._err.is_terminal else [" ".join(map(str.strip, lines))]:
-            if line:
-                self._err.print(line, markup=False, soft_wrap=True)
+        self._err.print(f"[{style}]{label}[/{style}] {escape(printable(notice.text))}", soft_wrap=True)
 
     def _begin(self, phase: Phase) -> None:
         self._bar = Bar(phase)
@@ -154,13 +144,10 @@ class Console:
         if sys.stdout is not None:
             sys.stdout.flush()
 
-    def say(self, text: str, *, indent: str = "") -> None:
-        """Print a line on stdout; on a terminal it is wrapped, with later lines indented by ``indent``."""
-        if self.quiet or self.as_json:
-            return
-        lines = wrapped(text, self._out.width, rest=indent, keep_spaces=True) if self._out.is_terminal else [text]
-        for line in lines:
-            self._out.print(line, markup=False)
+    def say(self, text: str) -> None:
+        """Print a line on stdout."""
+        if not (self.quiet or self.as_json):
+            self._out.print(text, markup=False)
 
     def heading(self, text: str) -> None:
         """Print an empty line and a heading on stdout."""
@@ -175,12 +162,8 @@ class Console:
         table, needed = self._table(title, columns, rows, frame=box.SIMPLE)
         if self._out.width < needed:
             table, needed = self._table(title, columns, rows, frame=None)  # narrower
-        if self._out.width < needed and (self._out.is_terminal or "COLUMNS" in os.environ):
-            for line in records(columns, rows):
-                self._out.print(line, markup=False)
-        else:  # pipes and files have any width
-            screen = self._out if needed <= self._out.width else _screen(sys.stdout, width=needed)
-            screen.print(table, soft_wrap=False)
+        screen = self._out if needed <= self._out.width else _screen(sys.stdout, width=needed)
+        screen.print(table, soft_wrap=False)
 
     def _table(
         self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, frame: box.Box | None

@@ -39,7 +39,7 @@ def doctor(_command: DoctorCommand, console: Console) -> None:
     for status in backends:
         _show(console, status.name, status.available, status.details or status.reason, status.remedy)
     if advice:
-        console.say(advice, indent="       ")
+        console.say(advice)
     console.heading("For some commands")
     for entry in optional.values():
         _show(console, entry["used_by"], entry["available"], entry["details"], entry["remedy"])
@@ -57,9 +57,9 @@ def doctor(_command: DoctorCommand, console: Console) -> None:
 
 
 def _show(console: Console, name: str, available: bool, details: str, remedy: str) -> None:
-    console.say(f"  {'yes' if available else 'no ':<3}  {name}: {details}", indent="       ")
+    console.say(f"  {'yes' if available else 'no ':<3}  {name}: {details}")
     if not available and remedy:
-        console.say(f"       to get it: {remedy}", indent="         ")
+        console.say(f"       to get it: {remedy}")
 
 
 def _optional() -> dict[str, dict[str, Any]]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Sequence
 
 import gs2d
 from gs2d.cli.command_line import NAMES, Option, about, options_of
 from gs2d.cli.command_registry import COMMANDS, GROUPS
 from gs2d.cli.commands import Common
-from gs2d.cli.layout import terminal_width
 from gs2d.pipeline.prepare.options import CommonTraining, HowItRuns, PoseEstimation, Training
 
 _SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."
@@ -23,6 +23,7 @@ _FIRST_DAY = """usage: gs2d COMMAND [OPTIONS]
 
 All commands: gs2d --help. Options of one: gs2d COMMAND --help."""
 _OWN = "Of this command"
+WIDEST = 100  # columns of help; longer lines are hard to read
 TITLES = {  # headings of shared options, in order
     PoseEstimation: "Cameras of photographs",
     CommonTraining: "Training",
@@ -76,8 +77,10 @@ def command_help(name: str, *, everything: bool = False) -> list[str]:
 
 
 def _parser(prog: str, usage: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    width = max(20, min(shutil.get_terminal_size().columns, WIDEST))
+
     def formatter(prog: str) -> argparse.HelpFormatter:
-        return argparse.HelpFormatter(prog, max_help_position=28, width=terminal_width())
+        return argparse.HelpFormatter(prog, max_help_position=28, width=width)
 
     return argparse.ArgumentParser(
         prog, usage, description, epilog, formatter_class=formatter, add_help=False, allow_abbrev=False
