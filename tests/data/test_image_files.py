@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d.data.image_files import image_size, read_image, read_mask, write_image
+from gs2d.data.image_files import image_size, read_grey, read_image, read_mask, write_image
 from gs2d.errors import DataError
 
 
@@ -108,3 +108,10 @@ def test_common_image_formats_are_read(tmp_path: Path) -> None:
         tmp_path / "phone.jpg", "MPO", save_all=True, append_images=[Image.new("RGB", (9, 9))]
     )
     assert read_image(tmp_path / "phone.jpg").shape == (10, 20, 3)
+
+
+def test_floats_are_depths_and_no_photographs(tmp_path: Path) -> None:
+    Image.fromarray(np.full((4, 5), 2.5, np.float32)).save(tmp_path / "depth.tif")
+    assert (read_grey(tmp_path / "depth.tif")[0] == 2.5).all()
+    with pytest.raises(DataError, match="must hold integers, got floats"):
+        read_image(tmp_path / "depth.tif")

@@ -13,7 +13,7 @@ from gs2d.core.extras import FFMPEG, install
 CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"  # as pytorch.org has it
 _EXTRAS = {  # extra -> (the commands that need it, its packages)
     "sfm": ("cameras of photographs (gs2d reconstruct, poses)", ("pycolmap",)),
-    "exr": ("float photographs, OpenEXR depth maps", ("OpenEXR", "tifffile")),
+    "exr": ("OpenEXR photographs and depth maps", ("OpenEXR",)),
     "geo": ("maps (gs2d survey --gps, --orthophoto)", ("pyproj", "tifffile")),
     "markers": ("printed markers (gs2d survey --markers)", ("opencv-python-headless",)),
     "collision": ("convex pieces (gs2d mesh --collision)", ("coacd",)),

@@ -1,53 +1,35 @@
-"""Images of linear floats with 1 as white, OpenEXR and TIFF, and their conversion to 8-bit sRGB.
-
-Decoded by OpenEXR and tifffile (extra ``exr``).
-"""
+"""OpenEXR images, linear floats with 1 as white, and their conversion to 8-bit sRGB (extra ``exr``)."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import io
-import logging
 import os
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from PIL import TiffImagePlugin
 
 from gs2d.core.extras import install
 from gs2d.core.growth import check_growth
-from gs2d.core.text import first_line
 from gs2d.errors import DataError
 
 EXR_SUFFIX = ".exr"
-TIFF_SUFFIXES = (".tif", ".tiff")
-_WIDTH, _HEIGHT, _SAMPLES, _FORMAT = 256, 257, 277, 339  # TIFF tags
-_FLOATS = 3  # value of _FORMAT
-_ASSOCIATED = 1  # extra sample: premultiplied alpha
-_BRIGHT = 0.5  # largest fraction of values above 1; with more, 1 is not white
 _ONE = threading.Lock()
 
 
-def display_values(light: np.ndarray, alpha: np.ndarray | None, *, associated: bool) -> np.ndarray:
-    """Convert linear light [H, W, 3] to sRGB: uint8 [H, W, 3], or [H, W, 4] with straight alpha.
+def display_values(light: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:
+    """Convert linear light [H, W, 3], premultiplied by ``alpha`` [H, W], to sRGB: uint8 [H, W, 3], or [H, W, 4].
 
     Values above 1 are clipped; negative values and NaN become black.
-
-    Parameters
-    ----------
-    alpha : ndarray [H, W] or None
-    associated : bool
-        Whether colours are premultiplied by alpha.
     """
     light = np.nan_to_num(light, nan=0.0, posinf=1.0, neginf=0.0)
     if alpha is None:
         return _to_bytes(_encode_srgb(light))
     alpha = np.clip(np.nan_to_num(alpha, nan=0.0), 0.0, 1.0)[..., None]
-    straight = np.divide(light, alpha, out=np.zeros_like(light), where=alpha > 0) if associated else light
+    straight = np.divide(light, alpha, out=np.zeros_like(light), where=alpha > 0)
     return _to_bytes(np.concatenate([_encode_srgb(straight), alpha], axis=-1))
 
 
@@ -151,7 +133,7 @@ def read_exr(path: str | os.PathLike[str]) -> np.ndarray:
     if names[0] not in channels:
         have = ", ".join(sorted(channels)) or "none"
         raise DataError(f"{os.fspath(path)} must have the channels R, G and B, or Y, got {have}; export colours")
-    return display_values(np.stack([channels[name] for name in names], axis=-1), channels.get("A"), associated=True)
+    return display_values(np.stack([channels[name] for name in names], axis=-1), channels.get("A"))
 
 
 def read_exr_map(path: str | os.PathLike[str]) -> np.ndarray:
@@ -169,77 +151,3 @@ def read_exr_map(path: str | os.PathLike[str]) -> np.ndarray:
         have = ", ".join(sorted(channels)) or "none"
         raise DataError(f"{os.fspath(path)} must have a channel Z or Y, or a single one, got {have}; export depths")
     return channels[names[0]]
-
-
-# -- TIFF --------------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class FloatTiff:
-    """Size of a TIFF of floats, px, and its samples per pixel."""
-
-    width: int
-    height: int
-    samples: int
-
-
-def float_tiff(path: str | os.PathLike[str]) -> FloatTiff | None:
-    """Return the header of a TIFF of floats; None for any other or damaged file."""
-    if not os.fspath(path).lower().endswith(TIFF_SUFFIXES):
-        return None
-    try:
-        with open(path, "rb") as file:
-            head = file.read(8)
-            head += file.read(8) if head[2:3] == b"+" else b""  # BigTIFF
-            tags = TiffImagePlugin.ImageFileDirectory_v2(head)
-            file.seek(tags.next)
-            tags.load(file)
-        width, height, samples = (int(tags.get(tag, 1)) for tag in (_WIDTH, _HEIGHT, _SAMPLES))
-        floats = tags.get(_FORMAT, (0,))[0] == _FLOATS
-    except Exception:  # of any kind, for damaged files; decoding reports the reason
-        return None
-    return FloatTiff(width, height, samples) if floats and min(width, height) > 0 else None
-
-
-def read_float_tiff(path: str | os.PathLike[str], header: FloatTiff) -> np.ndarray:
-    """Decode a TIFF photograph of floats to sRGB: uint8 [H, W, 3], or [H, W, 4] with straight alpha.
-
-    Raises
-    ------
-    DataError
-        If tifffile is not installed, the pixels do not decode, or most values are above 1.
-    """
-    name = os.fspath(path)
-    pixels = header.width * header.height
-    announced = f"an image ({header.width}x{header.height}, {header.samples} floats)"
-    check_growth(path, os.stat(path).st_size, pixels * header.samples * 8, announced)
-    values, associated = _decode_tiff(name)
-    if values.ndim != 3 or values.shape[:2] != (header.height, header.width) or values.shape[2] not in (1, 2, 3, 4):
-        raise DataError(f"image {name} must have one or three colours and at most alpha, got {list(values.shape)}")
-    colors = values.shape[2] - (values.shape[2] in (2, 4))
-    light, alpha = values[..., :colors], values[..., colors] if values.shape[2] > colors else None
-    if (light > 1).mean() > _BRIGHT:
-        raise DataError(
-            f"image {name} must be linear light with 1 as white, got floats up to {float(light.max()):.4g}, mostly "
-            "above 1; divide them by the value of white, or save 16-bit integers"
-        )
-    return display_values(np.repeat(light, 3, axis=2) if colors == 1 else light, alpha, associated=associated)
-
-
-def _decode_tiff(name: str) -> tuple[np.ndarray, bool]:
-    """Return float32 [H, W, samples] of the first page, and whether colours are premultiplied by alpha."""
-    try:
-        library: Any = importlib.import_module("tifffile")
-    except ImportError as error:
-        raise DataError(f"{name} is a TIFF of floats and needs tifffile; {install('exr')}") from error
-    logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)  # it logs every unknown tag
-    try:
-        with library.TiffFile(name) as file:
-            page = file.pages[0]
-            values = np.asarray(page.asarray(), dtype=np.float32)
-            axes, extra = str(page.axes), tuple(page.extrasamples)
-    except Exception as error:  # of any kind, for damaged files and missing decoders
-        raise DataError(
-            f"image {name} does not decode: {first_line(error)}; save it uncompressed, or by Deflate without predictor"
-        ) from error
-    if axes == "SYX":
-        values = np.moveaxis(values, 0, -1)
-    return values[..., None] if values.ndim == 2 else values, _ASSOCIATED in extra

@@ -18,7 +18,7 @@ from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.image_arrays import to_uint8
 from gs2d.core.text import first_line
-from gs2d.data.float_images import exr_size, float_tiff, is_exr, read_exr, read_exr_map, read_float_tiff
+from gs2d.data.float_images import exr_size, is_exr, read_exr, read_exr_map
 from gs2d.errors import DataError, ShapeError
 
 #: Formats that Pillow may open. Others are rarely tested or start external programs (EPS: Ghostscript).
@@ -82,15 +82,8 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """
     if is_exr(path):
         return exr_size(path)
-    if (floats := float_tiff(path)) is not None:
-        return floats.width, floats.height
     with _opened(path, "{path} must be an image, got: {error}") as file:
         return file.size
-
-
-def is_float(path: str | os.PathLike[str]) -> bool:
-    """Whether an image file holds linear floats."""
-    return is_exr(path) or float_tiff(path) is not None
 
 
 _UNDECODED = "image {path} does not decode: {error}; replace or remove the file"
@@ -100,7 +93,7 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode an image.
 
     EXIF orientation is **not** applied, as in COLMAP: poses refer to the stored pixels. Grey and palette images become
-    RGB, 16-bit grey becomes 8-bit, linear floats (OpenEXR, TIFF) become sRGB.
+    RGB, 16-bit grey becomes 8-bit, linear floats (OpenEXR) become sRGB.
 
     Returns
     -------
@@ -113,10 +106,10 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """
     if is_exr(path):
         return read_exr(path)
-    if (floats := float_tiff(path)) is not None:
-        return read_float_tiff(path, floats)
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
+        if file.mode == "F":
+            raise DataError(f"image {os.fspath(path)} must hold integers, got floats; save it as 16-bit or OpenEXR")
         if file.mode.startswith("I;16") or file.mode == "I":
             grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
             return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)

@@ -13,7 +13,8 @@ from PIL import ExifTags, Image
 
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.data.exif import DAMAGED_EXIF
-from gs2d.data.image_files import is_float, open_image, read_image
+from gs2d.data.float_images import is_exr
+from gs2d.data.image_files import open_image, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.photos import JPEG, Photo, turn
 
@@ -90,7 +91,7 @@ def _kept(source: Path) -> dict[str, bytes]:
 
     Nothing is kept of float images: they have been converted to sRGB, and Pillow cannot open all of them.
     """
-    if is_float(source):
+    if is_exr(source):
         return {}
     with open_image(source) as file:
         profile = file.info.get("icc_profile") if file.mode in ("RGB", "RGBA") else None
