@@ -26,8 +26,8 @@ from benchmarks.results import Case, Method, run_case
 from gs2d.core.json_files import write_json
 from gs2d.io.run_dir import SPLATS, RunFolder
 from gs2d.io.splat_ply import read_splats
-from gs2d.kernels.library import describe_library
 from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.render.backends import get_backend
 from gs2d.training.events import ignore
 
 CASES = {
@@ -66,7 +66,12 @@ def made_by(definition: dict[str, Any]) -> dict[str, Any]:
     words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(words, capture_output=True, text=True).stdout.strip()
     facts = {name: definition[key] for name, key in (("date", "created"), ("machine", "machine"))}
-    return {"commit": commit or None, **facts, "kernels": describe_library(), "versions": definition["versions"]}
+    return {
+        "commit": commit or None,
+        **facts,
+        "kernels": get_backend("cpu").status().details,
+        "versions": definition["versions"],
+    }
 
 
 def merge_row(file: Path, row: dict[str, Any]) -> None:

@@ -154,7 +154,7 @@ def test_evaluate_shows_what_is_missing_and_scores_the_surface(
     shutil.copytree(trained, copy)
     write_ball_mesh(copy / "mesh.ply")
     write_ball_mesh(tmp_path / "truth.ply")
-    assert run(["evaluate", str(copy), "--ground-truth", str(tmp_path / "truth.ply"), "--thresholds", "0.05"]) == 0
+    assert run(["evaluate", str(copy), "--ground-truth", str(tmp_path / "truth.ply"), "--set", "thresholds=0.05"]) == 0
     text = capsys.readouterr().out
     assert "no LPIPS weights" in text
     assert "8 bit" in text

@@ -129,7 +129,6 @@ def values_of(parsed: object, field: str) -> list[object]:
         ("train --viewer in --out out", "viewer", 0),
         ("train --viewer 81 in --out out", "viewer", 81),
         ("mesh run --set depth=median --set faces=9", "faces", 9),
-        ("poses in --out out --set link=true", "link", True),
         ("survey run --set up=0,1,0", "up", (0, 1, 0)),
         ("train in --out out --set stage2_cache_mb=9 --set a=1", "overrides", ("a=1",)),
     ],

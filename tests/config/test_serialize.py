@@ -84,9 +84,9 @@ def test_every_field_of_a_loss_is_written_and_can_be_set() -> None:
     assert plain.keys() == {entry.name for entry in fields(LossTerm)}
     said = {"edges": "camera", "where": "object"}
     overrides = [f"surface.losses.normal_consistency.options.{name}={value}" for name, value in said.items()]
-    overrides += ["surface.losses.normal_consistency.every=2"]
+    overrides += ["surface.losses.normal_consistency.start=2"]
     found = to_json(apply_overrides(get_recipe("2dgs"), overrides))["stages"][0]["losses"][2]
-    assert found == plain | {"options": said, "every": 2}
+    assert found == plain | {"options": said, "start": 2}
 
 
 def test_overrides_change_only_their_field() -> None:

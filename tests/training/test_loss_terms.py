@@ -22,7 +22,7 @@ from train_toys import same, short
 
 
 def with_terms(recipe: Recipe, **changes: Any) -> Recipe:
-    """Change fields of all terms of a kind, in all stages: ``normal_consistency={"every": 2}``."""
+    """Change fields of all terms of a kind, in all stages: ``normal_consistency={"start": 2}``."""
 
     def changed(stage: Stage) -> Stage:
         return replace(stage, losses=tuple(replace(t, **changes.get(t.kind, {})) for t in stage.losses))
@@ -47,20 +47,14 @@ def entered(scene: Scene, recipe: Recipe, backend: str) -> Trainer:
     return trainer
 
 
-def test_a_term_is_active_in_iterations_that_every_divides() -> None:
-    term = LossTerm("l1", 1.0, start=4, every=3)
-    assert [i for i in range(1, 13) if term.is_active(i)] == [6, 9, 12]
-    assert [i for i in range(1, 7) if LossTerm("l1", 1.0, start=4).is_active(i)] == [5, 6]
-
-
 def test_an_inactive_term_changes_nothing(scene: Scene, backend: str) -> None:
     trainer = entered(scene, short(), backend)
     stage = trainer.recipe.stages[0]
-    rare = with_terms(trainer.recipe, normal_consistency={"every": 3}).stages[0]
+    rare = with_terms(trainer.recipe, normal_consistency={"start": 8}).stages[0]
     without = replace(stage, losses=tuple(t for t in stage.losses if t.kind != "normal_consistency"))
     for iteration, other in ((7, without), (8, without), (9, stage)):
         found, expected = (trainer._whole.evaluate(trainer.state, s, iteration, 0) for s in (rare, other))
-        assert found.losses == expected.losses  # the weight is not rescaled
+        assert found.losses == expected.losses
         assert all(torch.equal(found.gradients[name], expected.gradients[name]) for name in expected.gradients)
     assert set(trainer._whole.evaluate(trainer.state, rare, 9, 0).losses) == {"l1", "ssim", "normal_consistency"}
 
@@ -73,7 +67,7 @@ def test_inputs_of_an_inactive_term_are_not_rendered(scene: Scene, monkeypatch: 
         return rasterize(splats, camera, settings, **options)
 
     recipe = short()
-    first = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("distortion", 1.0, every=2)))
+    first = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("distortion", 1.0, start=7)))
     recipe = replace(recipe, stages=(first, *recipe.stages[1:]))
     trainer = entered(scene, recipe, "reference")
     monkeypatch.setattr(objective, "rasterize", counted)
@@ -86,7 +80,7 @@ def test_inputs_of_an_inactive_term_are_not_rendered(scene: Scene, monkeypatch: 
 
 
 def test_a_training_with_options_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
-    said = {"every": 2, "options": {"where": "object", "edges": "camera"}}
+    said = {"options": {"where": "object", "edges": "camera"}}
     recipe, made = with_terms(short(), normal_consistency=said), cut_out(scene)
     end = Trainer(made, recipe, GENERIC, backend=backend).run()
     assert not same(end, Trainer(made, short(), GENERIC, backend=backend).run())

@@ -141,7 +141,7 @@ class ViewCommand(Common):
     "evaluate",
     action="gs2d.cli.handlers:evaluate",
     group=MEASURE,
-    first=("run", "ground_truth", "thresholds", "lpips_weights"),
+    first=("run", "ground_truth", "lpips_weights"),
 )
 @dataclass(frozen=True, kw_only=True)
 class EvaluateCommand(EvaluateOptions, Common):

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import IO, Any
 
-from rich import box
 from rich.console import Console as RichConsole
 from rich.live import Live
 from rich.markup import escape
@@ -19,11 +18,7 @@ from gs2d.cli.bar import Bar
 from gs2d.core.text import printable
 from gs2d.training.events import Event, Notice, NotMade, Phase, StageScored, Step
 
-LOG_SECONDS, LOG_FRACTION = (
-    60.0,
-    0.1,
-)  # in a log file: a line after this time, if this fraction of the phase was done since
-LOG_SILENCE = 300.0  # s, after which there is a line in any case; the first line needs only LOG_SECONDS
+LOG_SECONDS, LOG_FRACTION = 60.0, 0.02  # least time and part of a phase between two lines of a log file
 _ANY_WIDTH = 10_000  # columns
 _NO_SCREENS = ("dumb", "unknown")  # values of TERM without cursor movement
 
@@ -78,7 +73,6 @@ class Console:
         self._named: set[str] = set()  # phases with a line in the log file
         self.missing: list[NotMade] = []  # reported at the end of the command
         self._logged = (0.0, 0)  # time in s and finished steps of the last line of a log file
-        self._logs = 0  # lines of a log file about progress in the phase
 
     def on_event(self, event: Event) -> None:
         """Print an event of the pipeline."""
@@ -113,7 +107,7 @@ class Console:
                 name = printable(phase.name)
                 self._err.print(f"{name} ({phase.total})" if phase.total else name, markup=False)
             self._named.add(phase.name)
-            self._logged, self._logs = (time.monotonic(), phase.done), 0
+            self._logged = (time.monotonic(), phase.done)
         elif self._live is None:
             self._live = Live(self._bar, console=self._err, transient=True, refresh_per_second=4)
             self._live.start()
@@ -125,10 +119,9 @@ class Console:
             return
         self._bar.step(step.done, step.detail)
         total, (at, done) = self._bar.phase.total, self._logged
-        silence = time.monotonic() - at
-        due = LOG_FRACTION * total <= step.done - done or not self._logs or silence >= LOG_SILENCE
-        if not self._interactive and total and silence >= LOG_SECONDS and due:
-            self._logged, self._logs = (time.monotonic(), step.done), self._logs + 1
+        due = time.monotonic() - at >= LOG_SECONDS and step.done - done >= LOG_FRACTION * total
+        if not self._interactive and total and due:
+            self._logged = (time.monotonic(), step.done)
             line = f"{printable(self._bar.phase.name)}: {step.done:,} of {total:,}, {self._bar.left()}"
             self._err.print(line, markup=False, soft_wrap=True)
 
@@ -159,25 +152,14 @@ class Console:
         """Print a table on stdout; the first column is text, the others are numbers."""
         if self.quiet or self.as_json:
             return
-        table, needed = self._table(title, columns, rows, frame=box.SIMPLE)
-        if self._out.width < needed:
-            table, needed = self._table(title, columns, rows, frame=None)  # narrower
+        table = Table(title=escape(title) or None, title_justify="left", box=None, pad_edge=False)
+        for i, column in enumerate(columns):
+            table.add_column(escape(printable(column)), justify="left" if i == 0 else "right", no_wrap=True)
+        for row in rows:
+            table.add_row(*(escape(printable(cell)) for cell in row))
+        needed = self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
         screen = self._out if needed <= self._out.width else _screen(sys.stdout, width=needed)
         screen.print(table, soft_wrap=False)
-
-    def _table(
-        self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, frame: box.Box | None
-    ) -> tuple[Table, int]:
-        """Return a table and its width in columns."""
-        head, gap = escape(title) or None, "" if frame else " "
-        table = Table(title=head, title_justify="left", box=frame, padding=(0, 1 if frame else 0), pad_edge=False)
-        for i, column in enumerate(columns):
-            table.add_column(
-                gap * bool(i) + escape(printable(column)), justify="left" if i == 0 else "right", no_wrap=True
-            )
-        for row in rows:
-            table.add_row(*(gap * bool(i) + escape(printable(cell)) for i, cell in enumerate(row)))
-        return table, self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
 
     def result(self, value: Any) -> None:
         """Print the result as JSON on stdout, with ``as_json``."""

@@ -12,7 +12,6 @@ from gs2d.cli.console import Console, figure
 
 WIDTH = 60  # columns of the verdict: half of a small screen
 _NAMES, _GRADES = 14, 8  # columns of the names and grades of findings
-_MAX_LINES = 12  # of photographs without a camera; poses.json lists all
 _FILES = ("report.html", "scene.html", "mesh.ply", "mesh.glb", "splats.ply")
 
 
@@ -98,7 +97,7 @@ def show_surface(surface: dict[str, Any] | None, console: Console) -> None:
 
 def poses_lines(result: dict[str, Any]) -> list[str]:
     """Return the result of ``gs2d poses``: photographs with and without a camera, and the next command."""
-    from gs2d.pipeline.prepare.pose_finding import placed_line
+    from gs2d.pipeline.prepare.pose_finding import lost_lines, placed_line
 
     lines = [
         placed_line(result),
@@ -106,10 +105,7 @@ def poses_lines(result: dict[str, Any]) -> list[str]:
     ]
     if len(result["cameras"]) > 4:
         lines.append(f"and {len(result['cameras']) - 4} more cameras, in poses.json")
-    left_out = [row for row in result["photographs"] if not row["placed"]]
-    lines += [f"no camera: {row['source']}: {row['reason']}" for row in left_out[:_MAX_LINES]]
-    if len(left_out) > _MAX_LINES:
-        lines.append(f"no camera: {len(left_out) - _MAX_LINES} more, in poses.json")
+    lines += lost_lines(result)
     for other in result["other_models"]:
         lines.append(
             f"{other['folder']} holds a separate piece: {len(other['photos'])} photographs, {other['points']:,} points"

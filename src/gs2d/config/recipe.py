@@ -29,7 +29,7 @@ DEPTH_KINDS = ("mean", "median", "transmittance")
 
 @dataclass(frozen=True)
 class LossTerm:
-    """A loss of a stage: ``weight * LOSSES[kind]``, in every ``every``-th iteration > start.
+    """A loss of a stage: ``weight * LOSSES[kind]``, in each iteration > start.
 
     Attributes
     ----------
@@ -48,8 +48,6 @@ class LossTerm:
     options : mapping of str to values of JSON
         Keyword arguments of the loss, checked before training: ``edges`` and ``where`` of both normal consistencies,
         ``required`` of "silhouette" (``gs2d.losses.view_terms``).
-    every : int
-        The loss is active in iterations that this number divides. The weight is not multiplied by it.
 
     Raises
     ------
@@ -62,14 +60,13 @@ class LossTerm:
     start: int = 0
     depth: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    every: int = 1
 
     def __post_init__(self) -> None:
         LOSSES.check(self.kind)
 
     def is_active(self, iteration: int) -> bool:
         """Return whether the loss is active in an iteration (from 1) of the stage."""
-        return iteration > self.start and iteration % self.every == 0
+        return iteration > self.start
 
 
 @dataclass(frozen=True)
@@ -462,11 +459,9 @@ def _check_losses(where: str, stage: Stage) -> None:
         integer(f"{where}: start of loss {term.kind!r}", term.start, low=0)
         if term.depth is not None:
             one_of(f"{where}: depth of loss {term.kind!r}", term.depth, DEPTH_KINDS)
-        integer(f"{where}: every of loss {term.kind!r}", term.every, low=1)
     if stage.iterations > 0:
-        active = [term for term in stage.losses if term.weight != 0 and term.start == 0 and term.every == 1]
-        message = "no loss is active from the first iteration and in every one"
-        require(bool(active), f"{where}: {message}: got {kinds or 'none'}")
+        active = [term for term in stage.losses if term.weight != 0 and term.start == 0]
+        require(bool(active), f"{where}: no loss is active from the first iteration on: got {kinds or 'none'}")
         require(bool(stage.train), f"{where}: train names no attribute for {stage.iterations} iterations")
 
 

@@ -103,7 +103,7 @@ def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | 
 def check_thresholds(thresholds: tuple[float, ...]) -> None:
     """Raise DataError early for a threshold that is not a positive number."""
     if not all(t > 0 and math.isfinite(t) for t in thresholds):
-        raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, thresholds))}")
+        raise DataError(f"thresholds must be positive distances, got {', '.join(map(str, thresholds))}")
 
 
 def score_surface(
@@ -111,7 +111,7 @@ def score_surface(
 ) -> dict[str, Any]:
     """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); write coloured clouds to ``folder``."""
     if thresholds and not found.evaluator.has_thresholds:
-        tell(f"--thresholds is ignored: the evaluator {found.name} has its own protocol")
+        tell(f"--set thresholds is ignored: the evaluator {found.name} has its own protocol")
     facts = found.evaluator.score(mesh, found.truth, scene, folder=folder, thresholds=thresholds)
     for message in facts["self_check"]["messages"]:
         tell(message)

@@ -28,10 +28,8 @@ _FILTERS = "crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709:out_ra
 _TAGS = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv")
 
 
-def check_video(path: Path, fps: float, frames: int) -> Path:
-    """Check early that a video can be written, and return its path.
-
-    A name without a suffix gets ``.mp4`` if ffmpeg is on the PATH, else ``.webp``.
+def check_video(path: Path, fps: float, frames: int) -> None:
+    """Check early that a video can be written.
 
     Raises
     ------
@@ -40,8 +38,6 @@ def check_video(path: Path, fps: float, frames: int) -> Path:
     BackendError
         For ``.mp4`` without an ffmpeg that supports H.264.
     """
-    if not path.suffix:
-        path = path.with_name(path.name + (".webp" if _missing() else ".mp4"))
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise DataError(f"--video must name a .mp4 or .webp file, got {path}")
@@ -51,7 +47,6 @@ def check_video(path: Path, fps: float, frames: int) -> Path:
         raise DataError(f"--video needs at least 2 frames, got {frames}; render more")
     if suffix == ".mp4" and (missing := _missing()):
         raise BackendError(f"{path.name} needs ffmpeg, but {missing}; install it ({FFMPEG}), or use a .webp file")
-    return path
 
 
 def _missing() -> str:

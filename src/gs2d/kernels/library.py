@@ -173,9 +173,3 @@ def optional_library() -> Library | None:
 def library_for(tensor: torch.Tensor) -> Library | None:
     """Return :func:`optional_library` for a float32 tensor on the CPU; None for other tensors."""
     return optional_library() if tensor.is_cpu and tensor.dtype == torch.float32 else None
-
-
-def describe_library() -> str:
-    """Return a line for ``gs2d doctor``: instruction set, pixels per vector, threads."""
-    library = ready_library()
-    return f"{library.instruction_set}, {library.lanes} pixels per vector, {library.threads} threads"

@@ -284,10 +284,9 @@ def losses_of(recipe: Recipe) -> Losses:
         If a loss does not take its options, or a loss and the settings of the recipe that it needs are not both there.
     """
     losses, where = Losses(term for stage in recipe.stages for term in stage.losses), f"recipe {recipe.name!r}"
-    used = set()
+    used = {loss.settings for _, loss in losses}
     for kind, loss in losses:
         name = loss.settings
-        used.add(name)
         if name is not None and getattr(recipe, name) is None:
             raise RecipeError(f"{where}: {name} is null, but loss {kind!r} needs it; set {name} or leave the loss out")
     for name in SETTINGS:

@@ -30,7 +30,13 @@ from gs2d.pipeline.prepare.options import (
     TrainOptions,
     values,
 )
-from gs2d.pipeline.prepare.pose_finding import check_poses_options, find_poses, placed_line, requested_options
+from gs2d.pipeline.prepare.pose_finding import (
+    check_poses_options,
+    find_poses,
+    lost_lines,
+    placed_line,
+    requested_options,
+)
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.sfm.colmap_process import check_installed
@@ -41,7 +47,6 @@ from gs2d.training.events import Notice, OnEvent, ignore
 
 CAPTURE = "capture"
 GENERIC_NAMES = ("images", "photos", "photographs", "pictures")  # of folders: the report is named by the parent
-SHOWN_LOST = 3  # photographs without a camera that are named; poses.json has all
 
 
 def poses_options(options: ReconstructOptions) -> PosesOptions:
@@ -89,7 +94,7 @@ def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
             poses = find_poses(poses_options(options), on_event)
             if options.overwrite:  # its checkpoints belong to other cameras
                 RunFolder(options.out).clear()
-        for line in _lines(poses, capture):
+        for line in (f"{placed_line(poses)}; {capture / POSES_PNG} shows them", *lost_lines(poses)):
             on_event(Notice(line))
 
 
@@ -197,20 +202,10 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
                 raise RunError(
                     f"{name} {what} {options.photos} since the cameras were estimated; start again with --overwrite"
                 )
-        _lines(poses, capture)
+        placed_line(poses)
+        lost_lines(poses)
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise RunError(
             f"{capture / POSES_JSON} is not as `gs2d reconstruct` writes it ({error}); start again with --overwrite"
         ) from error
     return dict(poses)
-
-
-def _lines(poses: dict[str, Any], capture: Path) -> list[str]:
-    """Return how many photographs were placed, and the first ones without a camera."""
-    lost = [row for row in poses["photographs"] if not row["placed"]]
-    more = len(lost) - SHOWN_LOST
-    return [
-        f"{placed_line(poses)}; {capture / POSES_PNG} shows them",
-        *(f"no camera: {row['source']}: {row['reason']}" for row in lost[:SHOWN_LOST]),
-        *([f"{more} more without a camera are listed in {capture / POSES_JSON}"] if more > 0 else []),
-    ]

@@ -81,7 +81,7 @@ def test_a_scan_of_dtu_is_scored_in_millimetres(tmp_path: Path) -> None:
         assert result[name] == pytest.approx(figures[name], rel=0.02), name
     assert result["self_check"] == {"ok": True, "messages": []}
     assert result["protocol"]["max_distance"] == 20
-    assert told == ["--thresholds is ignored: the evaluator dtu has its own protocol"]
+    assert told == ["--set thresholds is ignored: the evaluator dtu has its own protocol"]
     assert (tmp_path / "surface/surface.png").is_file()
 
 

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gs2d.core.atomic_files import check_writable
 from gs2d.core.camera import Camera
-from gs2d.core.extras import FFMPEG
 from gs2d.core.json_files import write_json
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
@@ -200,9 +199,8 @@ def render_run(
     from gs2d.io.video import write_video
 
     path, out = Path(path), None if out is None else Path(out)
-    video = check_frames(options)
-    if video is not None and video != options.video and video.suffix == ".webp":
-        on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
+    check_frames(options)
+    video = options.video
     run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
     kind, views = _views(path, options, loaded, on_event)
     if options.width is not None:
@@ -281,8 +279,8 @@ def _alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
-def check_frames(options: RenderOptions) -> Path | None:
-    """Return the path of the video, if there is one; raise for invalid options."""
+def check_frames(options: RenderOptions) -> None:
+    """Raise for invalid options."""
     from gs2d.io.video import check_video
 
     orbit, width, video = options.orbit, options.width, options.video
@@ -296,9 +294,8 @@ def check_frames(options: RenderOptions) -> Path | None:
     else:
         if not orbit:
             raise RunError("--video needs --orbit N, N >= 2")
-        video = check_video(video, options.fps, orbit)
+        check_video(video, options.fps, orbit)
         check_writable(video)
-    return video
 
 
 def _spare_photographs(files: Sequence[Path], option: str, loaded: LoadedRun) -> None:

@@ -14,10 +14,9 @@ from typing import Any
 
 from gs2d.config import grades
 from gs2d.config.grades import GOOD, POOR, USABLE
-from gs2d.config.serialize import decode
 from gs2d.core.json_files import read_json, write_json
 from gs2d.data import Scene
-from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.errors import DataError, RunError
 from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import VERDICT, RunFolder
@@ -255,7 +254,7 @@ def _some(names: Sequence[str]) -> str:
 
 # -- verdict.json ------------------------------------------------------------------------------------------------------
 def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> dict[str, Any]:
-    """Judge a run and write ``verdict.json``; without newly measured views, judge the earlier measures again.
+    """Judge a run and write ``verdict.json``; without newly measured views, return the earlier verdict.
 
     Raises
     ------
@@ -265,9 +264,11 @@ def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> di
     """
     if collected.failure is not None:
         raise collected.failure
-    measures = (
-        Measures(collected.views, *placed_photographs(loaded.scene.root)) if collected.views else _measured_before(run)
-    )
+    if not collected.views:
+        if not run.file(VERDICT).exists():
+            raise RunError("the run was interrupted between scoring and measuring; `gs2d evaluate RUN` measures it")
+        return _read(run)
+    measures = Measures(collected.views, *placed_photographs(loaded.scene.root))
     data = {"format": FORMAT, "verdict": asdict(judge(measures)), "measured": asdict(measures)}
     write_json(run.file(VERDICT), data)
     return data
@@ -286,13 +287,3 @@ def _read(run: RunFolder) -> dict[str, Any]:
     data: dict[str, Any] = read_json(path)
     check_shape(path, data, VERDICT_SHAPE, "delete it; `gs2d evaluate RUN` writes it again")
     return data
-
-
-def _measured_before(run: RunFolder) -> Measures:
-    if not run.file(VERDICT).exists():
-        raise RunError("the run was interrupted between scoring and measuring; `gs2d evaluate RUN` measures it")
-    try:
-        measures: Measures = decode(_read(run)["measured"], Measures, "measured")
-        return measures
-    except (KeyError, RecipeError) as error:
-        raise RunError(f"{run.file(VERDICT)} must hold measures as gs2d writes them; delete it ({error})") from error

@@ -184,8 +184,6 @@ class PoseEstimation:
     """Also use features in masked pixels, for an object that did not move relative to its background."""
     frames: int = 100
     """Number of frames to take from a video; each is the sharpest of its interval (needs ffmpeg)."""
-    link: Annotated[bool, SETTING] = False
-    """Hard-link the photographs instead of copying them."""
 
 
 # -- commands that create a run ----------------------------------------------------------------------------------------
@@ -338,7 +336,7 @@ class EvaluateOptions:
 
     ground_truth: Annotated[Path | None, Arg(metavar="MESH_OR_POINTS")] = None
     """True surface (PLY or OBJ) in the frame of the capture, or the official folder of DTU or Tanks and Temples."""
-    thresholds: tuple[float, ...] = ()
+    thresholds: Annotated[tuple[float, ...], SETTING] = ()
     """Thresholds for precision and recall, world units (default: 0.25, 0.5 and 1 % of the size of the true surface)."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights; without them LPIPS is not computed."""

@@ -86,6 +86,7 @@ LIMITS = {
 }
 FRAMES = "frames"  # folder of the frames of a video, in the workspace
 _SHOWN_MODELS = 5
+SHOWN_LOST = 5  # photographs without a camera that are named
 _FEW_PLACED, _LARGE_ERROR, _SMALL_ANGLE = 0.8, 1.5, 4.0  # fraction of photographs; px; degrees
 
 
@@ -133,7 +134,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
                 result["seconds"] = round(time.monotonic() - started, 1)
                 on_event(Phase("checking the capture", 0))
                 with attempted(POSES_PNG, "", on_event):
-                    write_image_of(capture / POSES_PNG, models[0], _title(result))
+                    write_image_of(capture / POSES_PNG, models[0], placed_line(result))
                 write_json(capture / POSES_JSON, result)
                 load_scene(capture, format="colmap")
             except DataError:
@@ -188,7 +189,6 @@ def _source_facts(options: PosesOptions, paths: Sequence[Path]) -> dict[str, Any
         "photos": str(options.photos.resolve()),
         "files": [_stamp(path) for path in paths or [options.photos]],
         "max_size": options.max_size,
-        "link": options.link,
         "frames": None if paths else options.frames,
     }
 
@@ -256,13 +256,10 @@ def _frames_of(video: Video, work: Path, count: int, source: dict[str, Any], on_
 def _stage(
     photos: Sequence[Photo], folder: Path, options: PosesOptions, threads: int, on_event: OnEvent, *, is_video: bool
 ) -> list[str]:
-    """Copy or link the photographs into the capture; return how each was copied."""
-    link = options.link or is_video  # frames are ours
-    copying = copy_images(photos, folder, max_size=options.max_size, link=link, threads=threads)
+    """Copy the photographs into the capture, or link the frames of a video; return how each was copied."""
+    copying = copy_images(photos, folder, max_size=options.max_size, link=is_video, threads=threads)
     with contextlib.closing(copying):  # stops writing after Ctrl-C
         staged = list(counted(copying, "copying photographs", len(photos), on_event))
-    if options.link and (copied := staged.count("copied")):
-        on_event(Notice(f"{copied} photographs were copied: --out is on a file system that cannot link to theirs"))
     if turned := sum(photo.orientation != 1 for photo in photos):
         on_event(Notice(f"{turned} photographs were turned upright, following their EXIF orientation", detail=True))
     return staged
@@ -409,11 +406,12 @@ def placed_line(result: dict[str, Any]) -> str:
     )
 
 
-def _title(result: dict[str, Any]) -> str:
-    return (
-        f"{result['placed']} of {result['count']} photographs placed, {result['points']:,} points, "
-        f"{result['mean_error_px']:.2f} px"
-    )
+def lost_lines(result: dict[str, Any]) -> list[str]:
+    """Return why photographs have no camera, one line each; many are in ``poses.json`` only."""
+    lost = [row for row in result["photographs"] if not row["placed"]]
+    more = len(lost) - SHOWN_LOST
+    lines = [f"no camera: {row['source']}: {row['reason']}" for row in lost[:SHOWN_LOST]]
+    return [*lines, f"no camera: {more} more, in {POSES_JSON}"] if more > 0 else lines
 
 
 def _warnings(result: dict[str, Any]) -> list[str]:
