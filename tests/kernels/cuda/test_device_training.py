@@ -23,7 +23,7 @@ from emulate import Emulator
 from fake_backends import altered, cuda_on_host
 from gs2d.config.protocols import GENERIC
 from gs2d.config.quantities import EXPOSURE, POSES
-from gs2d.config.recipe import GradDensify, Recipe
+from gs2d.config.recipe import GradDensify, LossTerm, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
@@ -71,6 +71,7 @@ VARIANTS = {
     "plain": train_toys.short(),
     "exposure": train_toys.short().with_learned(replace(EXPOSURE, start=2, decay_steps=10)),
     "poses": train_toys.short().with_learned(replace(POSES, start=2, decay_steps=10)),
+    "distortion": in_first_stage(losses=(*train_toys.short().stages[0].losses, LossTerm("distortion", 10.0))),
 }
 
 
@@ -159,7 +160,7 @@ def quiet(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=(longer[0], *recipe.stages[1:]))
 
 
-@pytest.mark.parametrize(("stage", "variant"), [(0, "plain"), (0, "exposure"), (1, "plain"), (2, "plain")])
+@pytest.mark.parametrize(("stage", "variant"), [(0, "plain"), (0, "distortion"), (1, "plain"), (2, "plain")])
 def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
     emulated: Backend, scene: Scene, stage: int, variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,7 +199,7 @@ def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
         trainer.step()
 
 
-@pytest.mark.parametrize(("slack", "variant"), [(1.25, "plain"), (0.5, "exposure")])
+@pytest.mark.parametrize(("slack", "variant"), [(1.25, "plain"), (0.5, "distortion")])
 def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     emulated: Backend, scene: Scene, slack: float, variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
