@@ -65,7 +65,7 @@ INSIDE = {
         "prior_terms": 3,
         "known_maps view_terms": 2,
         "base prior_formulas": 1,
-        "formulas view_pair": 0,
+        "formulas": 0,
     },
     "pipeline": {
         "file_mesh": 7,
@@ -93,7 +93,7 @@ INSIDE = {
         "first_splats objective resumable": 4,
         "actions densify robust": 3,
         "optimizer parallel rows": 2,
-        "learned neighbours state": 1,
+        "learned state": 1,
         "events learned_rows start step_result targets": 0,
     },
 }
