@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from gs2d.meshing.mesh_methods import register_mesh_method
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
     from gs2d.pipeline.prepare.options import MeshOptions, Training, TrainOptions
-    from gs2d.render.api import rasterize, splat_errors, splat_sums
+    from gs2d.render.api import first_contributors, rasterize, splat_errors, splat_sums
     from gs2d.render.backends import backend_report, get_backend, register_backend
     from gs2d.render.tensor_api import CameraTensors, SplatTensors, rasterize_2dgs
-    from gs2d.render.types import RasterSettings, RenderOutput
+    from gs2d.render.types import Contributors, RasterSettings, RenderOutput
     from gs2d.report.sections.section_registry import register_section
     from gs2d.training.learned.quantity import LearnedQuantity
     from gs2d.training.trainer import Trainer, TrainerOptions
@@ -48,6 +48,7 @@ __version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
 __all__ = [
     "Camera",
     "CameraTensors",
+    "Contributors",
     "Gs2dError",
     "LearnedQuantity",
     "Loss",
@@ -74,6 +75,7 @@ __all__ = [
     "compute_losses",
     "evaluate",
     "extract_mesh",
+    "first_contributors",
     "get_backend",
     "get_recipe",
     "list_recipes",
@@ -109,6 +111,7 @@ __all__ = [
 _HOME = {
     "Camera": "gs2d.core.camera",
     "CameraTensors": "gs2d.render.tensor_api",
+    "Contributors": "gs2d.render.types",
     "Gs2dError": "gs2d.errors",
     "Loss": "gs2d.losses.base",
     "LearnedQuantity": "gs2d.training.learned.quantity",
@@ -134,6 +137,7 @@ _HOME = {
     "compute_losses": "gs2d.losses.base",
     "evaluate": "gs2d.pipeline.in_memory",
     "extract_mesh": "gs2d.pipeline.in_memory",
+    "first_contributors": "gs2d.render.api",
     "get_backend": "gs2d.render.backends",
     "get_recipe": "gs2d.config.presets",
     "list_recipes": "gs2d.config.presets",

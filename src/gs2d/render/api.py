@@ -97,9 +97,18 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import attach_pose_grad, with_world_normals
-from gs2d.render.types import MAX_COLOR, NEAR_PLANE_POLICIES, PLAIN_COLORS, Features, RasterSettings, RenderOutput
+from gs2d.render.reference_contributors import first_contributors as first_of
+from gs2d.render.types import (
+    MAX_COLOR,
+    NEAR_PLANE_POLICIES,
+    PLAIN_COLORS,
+    Contributors,
+    Features,
+    RasterSettings,
+    RenderOutput,
+)
 
-__all__ = ["rasterize", "rasterize_features", "splat_errors", "splat_sums"]
+__all__ = ["first_contributors", "rasterize", "rasterize_features", "splat_errors", "splat_sums"]
 
 
 def rasterize(
@@ -341,6 +350,49 @@ def splat_sums(
             image = rasterize_features(plain, camera, settings, features, backend=chosen).color
         (sums,) = torch.autograd.grad(image, colors, grad_outputs=target)
     return sums[:, : values.shape[-1]], sums[:, values.shape[-1]]
+
+
+def first_contributors(
+    splats: Splats,
+    camera: Camera,
+    points: Tensor,
+    count: int = 8,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
+) -> Contributors:
+    """Return the first splats that are blended into points of an image, differentiably.
+
+    For some points: each is compared with every splat, in plain torch on the device of the splats. Weights, depth,
+    normals and uv have gradients by the splats; the camera gets none.
+
+    Parameters
+    ----------
+    splats, camera, settings
+        As for :func:`rasterize`.
+    points : Tensor [P, 2]
+        (x, y), px; the centre of the first pixel is (0.5, 0.5). Dtype and device of the splats.
+    count : int
+        K.
+
+    Returns
+    -------
+    Contributors
+        ``ids``, ``weights``, ``depth``, ``normal`` and ``uv``, each with a leading [P, K].
+
+    Raises
+    ------
+    ShapeError
+        As for :func:`rasterize`, or if ``count`` is not positive.
+    """
+    _check_types(splats, camera, settings, points=points)
+    check_shapes({"points": (points, "P 2")})
+    if (points.dtype, points.device) != (splats.dtype, splats.device) or count < 1:
+        raise ShapeError(
+            f"first_contributors needs points of {splats.dtype} on {splats.device} like the splats and a positive "
+            f"count, got {points.dtype} on {points.device} and {count}"
+        )
+    camera = replace(camera, pose=None, intrinsics=None)
+    settings, camera = _checked_view(splats, camera, settings, get_backend("reference"), None)
+    return first_of(splats, camera, points, count, settings)
 
 
 def check_dense(name: str, tensor: object) -> None:

@@ -93,6 +93,7 @@ class Pairs:
     rho: Tensor  # [n, P]
     depth: Tensor  # [n, P] world units; z_c where the pair does not use the plane, so always finite
     near_enough: Tensor  # [n, P] bool: passes the near test of rule 5
+    uv: Tensor  # [n, P, 2] standard deviations; 0 where the pair does not use the plane
 
 
 def evaluate_pairs(
@@ -132,7 +133,7 @@ def evaluate_pairs(
     depth = (uv * screen.Tw[:, None, :2]).sum(dim=2) + screen.Tw[:, None, 2]
     if settings.lowpass_depth == "plane":
         depth = torch.where(hit & ~on_plane, _plane_depth_at(h_u, h_v, screen.Tw, hit & ~on_plane), depth)
-    return Pairs(rho, depth, depth.detach() >= settings.near)
+    return Pairs(rho, depth, depth.detach() >= settings.near, uv)
 
 
 def blend_weights(alpha: Tensor, settings: RasterSettings) -> tuple[Tensor, Tensor]:

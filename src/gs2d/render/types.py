@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -96,6 +96,31 @@ class RasterSettings:
     def depth_width(self, camera: Camera) -> float:
         """Return kappa of rule 22: the half width as a fraction of the depth."""
         return self.depth_width_px / math.sqrt(camera.fx * camera.fy)
+
+
+class Contributors(NamedTuple):
+    """The first K splats that are blended into each of P points of an image, front to back.
+
+    Attributes
+    ----------
+    ids : Tensor [P, K] int64
+        Rows of the splats; -1 where fewer than K contribute, and 0 in the other tensors.
+    weights : Tensor [P, K]
+        w of rule 7 of the contract (``gs2d.render.api``).
+    depth : Tensor [P, K] world units
+        Of the intersection; of the centre where the low-pass filter draws the splat.
+    normal : Tensor [P, K, 3]
+        World frame, unit length, facing the camera.
+    uv : Tensor [P, K, 2]
+        Intersection in the splat's plane, in standard deviations along its axes (with a Mip filter, the widened ones);
+        0 where the low-pass filter draws it.
+    """
+
+    ids: Tensor
+    weights: Tensor
+    depth: Tensor
+    normal: Tensor
+    uv: Tensor
 
 
 @dataclass(frozen=True, eq=False)
