@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -22,6 +23,7 @@ from gs2d.meshing.warped_ncc import (
     PixelPull,
     Surface,
     VertexPull,
+    brightness_share,
     draw_mesh,
     gather_vertices,
     match_views,
@@ -148,6 +150,25 @@ def test_photographs_that_show_other_things_hardly_pull() -> None:
     settings = MatchSettings(radius=3)
     pull = pulled(vertices, (pair[0], noise), settings, None)[1]
     assert pull.curvature.sum() < 0.05 * pulled(vertices, pair, settings, None)[1].curvature.sum()
+
+
+def test_the_share_of_brightness_tells_reflections_from_texture_and_exposure(fast: Library) -> None:
+    pair, vertices = pair_and_start()
+    faces = sheet().faces
+    depths = [draw_mesh(vertices, faces, item.camera, library=fast).depth for item in pair]
+    exposed = GreyImage(pair[1].camera, 0.6 * pair[1].grey)
+    across = np.linspace(0.0, 0.5, exposed.grey.shape[1])
+    shiny = GreyImage(exposed.camera, exposed.grey + across)
+
+    def shares(other: GreyImage, library: Library | None) -> np.ndarray:
+        share, weight = brightness_share(pair[0], other, *depths, MatchSettings(occluded=0.1), library=library)
+        assert (np.isnan(share) <= (weight == 0)).all()
+        return share
+
+    matt = shares(exposed, None)
+    assert np.nanmedian(matt) < 0.05
+    assert np.nanmedian(shares(shiny, None)) > 0.3
+    np.testing.assert_allclose(shares(exposed, fast), matt, atol=1e-3)
 
 
 def test_outlines_are_not_compared() -> None:
@@ -278,6 +299,24 @@ def test_without_texture_noise_is_smoothed_and_the_surface_stays(fast: Library) 
     assert abs(moved.mean()) < 0.002
 
 
+def test_surface_whose_brightness_depends_on_the_view_keeps_its_shape(fast: Library) -> None:
+    truth, taken = sheet(side=60), list[GreyImage]()
+    for number, item in enumerate(photographs_of(True)):
+        x = points_of(item.camera, draw_mesh(truth.vertices, truth.faces, item.camera, library=fast))[..., 0]
+        taken.append(GreyImage(item.camera, item.grey + 0.2 * np.sin(2 * number + 2 * x)))
+    mesh = rough_sheet()
+    result = Refinement(mesh, CAMERAS, lambda index, _factor: taken[index], QUICK, fast).run(lambda _done: None)
+    assert error(result) > 0.9 * error(mesh)  # a matt one: 0.4
+
+
+def test_parts_as_thin_as_their_outlines_keep_their_shape(fast: Library) -> None:
+    mesh = rough_sheet()
+    rod = Mesh(mesh.vertices * [1.0, 0.03, 1.0], mesh.faces)
+    images, settings = photographs_of(True), replace(QUICK, face_pixels=1e-3)
+    result = Refinement(rod, CAMERAS, lambda index, _factor: images[index], settings, fast).run(lambda _done: None)
+    np.testing.assert_allclose(result.vertices[: len(rod.vertices)], rod.vertices, atol=1e-12)
+
+
 def test_numpy_refines_as_the_kernels_do(fast: Library) -> None:
     native, plain = refined(rough_sheet(), library=fast), refined(rough_sheet(), library=None)
     np.testing.assert_allclose(native.vertices, plain.vertices, atol=2e-3)
@@ -301,8 +340,8 @@ def test_work_is_counted_to_its_end(fast: Library) -> None:
 
     refinement = Refinement(rough_sheet(), CAMERAS, read, settings, fast)
     refinement.run(heard.append)
-    assert heard == [1, 2, 3, 4, 5, 9, 13, 17, 21, 25]
-    assert refinement.work == 25
+    assert heard == [*range(1, 11), 14, 18, 22, 26, 30]
+    assert refinement.work == 30
 
 
 def test_photographs_are_halved_down_to_a_shorter_side() -> None:

@@ -12,9 +12,21 @@ from gs2d.core.camera import Camera
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
 
-__all__ = ["GatherArguments", "MatchArguments", "RasterArguments", "draw_on_cpu", "gather_on_cpu", "lens_of"]
+__all__ = [
+    "PLANES",
+    "VISIBLE",
+    "WARPED",
+    "GatherArguments",
+    "MatchArguments",
+    "RasterArguments",
+    "draw_on_cpu",
+    "gather_on_cpu",
+    "lens_of",
+    "match_on_cpu",
+]
 
 PLANES = 7  # images in the workspace of a comparison
+WARPED, VISIBLE = 0, 2  # of them: the neighbour as the view sees it, and where (1 or 0)
 
 
 class RasterArguments(ctypes.Structure):

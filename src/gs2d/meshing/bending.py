@@ -117,14 +117,15 @@ class Curvature:
 
     def smooth(self, rounds: int) -> np.ndarray:
         """Return the values averaged over ``rounds`` rings of neighbours, weighted by area: the total stays."""
-        degree = np.maximum(self.graph.diagonal(), 1.0)
-        total = self.values * self.areas
-        areas = self.areas.copy()
-        for _ in range(rounds):
-            # half of a vertex's share stays, the rest goes to its neighbours in equal parts
-            total -= 0.5 * (self.graph @ (total / degree))
-            areas -= 0.5 * (self.graph @ (areas / degree))
+        total, areas = self.spread(self.values * self.areas, rounds), self.spread(self.areas, rounds)
         return np.where(self.graph.diagonal() > 0, total / np.maximum(areas, _TINY), 0.0)
+
+    def spread(self, amounts: np.ndarray, rounds: int) -> np.ndarray:
+        """Return amounts [P] after each vertex has given half of its own to its neighbours, in equal parts, in turn."""
+        degree = np.maximum(self.graph.diagonal(), 1.0)
+        for _ in range(rounds):
+            amounts = amounts - 0.5 * (self.graph @ (amounts / degree))
+        return amounts
 
 
 def solve(matrix: csr_array, right: np.ndarray, *, steps: int, tolerance: float) -> np.ndarray:

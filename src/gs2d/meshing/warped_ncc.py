@@ -17,12 +17,14 @@ import ctypes
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, uniform_filter
 
 from gs2d.core.camera import Camera
 from gs2d.kernels.library import Library
 from gs2d.kernels.native_refine import (
     PLANES,
+    VISIBLE,
+    WARPED,
     GatherArguments,
     MatchArguments,
     draw_on_cpu,
@@ -35,6 +37,7 @@ from gs2d.meshing.raycast import NEAR, cast_camera, outlines
 MIN_SCALE = 0.1  # depth in the neighbour / depth in the view; as in kernels/cpu/refine.cpp
 OUTLINE = 2  # px on both sides of an outline that are ignored
 ENOUGH = 0.5  # fraction of a window that must be visible in both images
+DARK = 0.02  # grey value below which the brightness of two images is not compared
 
 
 @dataclass(frozen=True)
@@ -202,7 +205,19 @@ def match_views(
     """
     if library is None:
         _match(view, other, depth, other_depth, settings, into)
-        return
+    else:
+        _match_natively((view, other), (depth, other_depth), settings, into, library)
+
+
+def _match_natively(
+    pair: tuple[GreyImage, GreyImage],
+    depths: tuple[np.ndarray, np.ndarray],
+    settings: MatchSettings,
+    into: PixelPull,
+    library: Library,
+) -> np.ndarray:
+    """Call the kernel; return its workspace [7, H, W], which begins with the warped neighbour."""
+    (view, other), (depth, other_depth) = pair, depths
     motion = _motion(view, other)
     dtype = f"f{library.dtype.itemsize}"
     arrays = {
@@ -230,6 +245,56 @@ def match_views(
         **{name: None if array is None else array.ctypes.data for name, array in arrays.items()},
     )
     match_on_cpu(library, arguments)
+    planes: np.ndarray = arrays["planes"]
+    return planes
+
+
+def brightness_share(
+    view: GreyImage,
+    other: GreyImage,
+    depth: np.ndarray,
+    other_depth: np.ndarray,
+    settings: MatchSettings,
+    *,
+    library: Library | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which share of the difference between two images is brightness, and the weight of each pixel.
+
+    Around each pixel, d is the difference of the mean grey values after one gain for the whole image, and v the sum of
+    both variances. The share d^2 / (d^2 + v) is small on matt surfaces. Where it is large, brightness depends on the
+    direction of view: a reflection, whose texture is not on the surface.
+
+    Parameters
+    ----------
+    view, other, depth, other_depth, settings, library
+        As of :func:`match_views`.
+
+    Returns
+    -------
+    share, weight : ndarray [H, W] float64
+        Where the images cannot be compared, NaN and 0. The weight is that of texture in :func:`match_views`.
+    """
+    if library is None:
+        warped, _, visible = _warped(view, other, depth, other_depth, settings.occluded)
+    else:
+        into = PixelPull.zeros(view.camera, f"f{library.dtype.itemsize}")
+        planes = _match_natively((view, other), (depth, other_depth), settings, into, library)
+        warped, visible = planes[WARPED], planes[VISIBLE] > 0
+    seen = visible.astype(np.float64)
+    a, b = view.grey * seen, np.asarray(warped, np.float64)
+    n, sum_a, sum_b, aa, bb = (_sums(k, settings.radius) for k in (seen, a, b, a * a, b * b))
+    enough = visible & (n >= ENOUGH * (2 * settings.radius + 1) ** 2)
+    n = np.maximum(n, 1.0)
+    mean_a, mean_b = sum_a / n, sum_b / n
+    lit = enough & (mean_a > DARK) & (mean_b > DARK)
+    gain = float(np.exp(np.median(np.log(mean_a[lit] / mean_b[lit])))) if lit.any() else 1.0
+    var_a = np.maximum(aa / n - mean_a**2, 0.0)
+    var_b = np.maximum(bb / n - mean_b**2, 0.0) * gain**2
+    weaker = np.minimum(var_a, var_b)
+    weight = np.where(enough, weaker / (weaker + settings.texture), 0.0)
+    brighter = (mean_a - gain * mean_b) ** 2
+    share = brighter / np.maximum(brighter + var_a + var_b, 1e-12)
+    return np.where(enough, share, np.nan), weight
 
 
 def gather_vertices(
@@ -329,9 +394,8 @@ def _warped(
 
 def _sums(values: np.ndarray, radius: int) -> np.ndarray:
     """Return the sums over windows, with zeros beyond the border."""
-    padded = np.pad(values, radius)
     side = 2 * radius + 1
-    return np.lib.stride_tricks.sliding_window_view(padded, (side, side)).sum(axis=(2, 3))
+    return np.asarray(uniform_filter(values, side, np.float64, mode="constant") * side**2)
 
 
 def _match(
