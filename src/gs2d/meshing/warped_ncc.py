@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, uniform_filter
@@ -142,7 +143,7 @@ class PixelPull:
     sums: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
     @classmethod
-    def zeros(cls, camera: Camera, dtype: type | str = np.float32) -> PixelPull:
+    def zeros(cls, camera: Camera, dtype: np.dtype[Any] | type | str = np.float32) -> PixelPull:
         """Return zeros for the pixels of a camera."""
         return cls(*(np.zeros((camera.height, camera.width), dtype) for _ in range(2)))
 
@@ -220,6 +221,7 @@ def _match_natively(
     (view, other), (depth, other_depth) = pair, depths
     motion = _motion(view, other)
     dtype = f"f{library.dtype.itemsize}"
+    planes = np.empty((PLANES, *depth.shape), dtype)
     arrays = {
         "grey": np.ascontiguousarray(view.grey, dtype),
         "source": np.ascontiguousarray(other.grey, dtype),
@@ -227,7 +229,7 @@ def _match_natively(
         "source_usable": None if other.usable is None else np.ascontiguousarray(other.usable, np.uint8),
         "depth": np.ascontiguousarray(depth, dtype),
         "source_depth": np.ascontiguousarray(other_depth, dtype),
-        "planes": np.empty((PLANES, *depth.shape), dtype),
+        "planes": planes,
         "gradient": into.gradient,
         "curvature": into.curvature,
         "sums": into.sums,
@@ -245,7 +247,6 @@ def _match_natively(
         **{name: None if array is None else array.ctypes.data for name, array in arrays.items()},
     )
     match_on_cpu(library, arguments)
-    planes: np.ndarray = arrays["planes"]
     return planes
 
 
