@@ -7,10 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import torch
 
 from gs2d.cli import run
-from gs2d.cli.doctor import CPU_TORCH
 from gs2d.core.extras import EXTRAS, install
 
 ROOT = Path(__file__).parents[2]
@@ -38,15 +36,3 @@ def test_doctor_checks_the_requirements_of_every_command(
     assert "no   textured meshes (--texture): xatlas missing\n       to get it: pip install 'xatlas" in text
     ffmpeg = "no   videos, read and written (gs2d render --video x.mp4): ffmpeg, ffprobe missing"
     assert f"{ffmpeg}\n       to get it: apt" in text
-
-
-def test_doctor_suggests_the_cpu_build_of_torch_without_a_gpu(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    assert run(["doctor", "--json"]) == 0
-    assert CPU_TORCH in json.loads(capsys.readouterr().out)["advice"]
-    monkeypatch.setattr(torch.version, "cuda", None)
-    assert run(["doctor", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["advice"] == ""

@@ -10,7 +10,6 @@ from gs2d.cli.commands import DoctorCommand
 from gs2d.cli.console import Console
 from gs2d.core.extras import FFMPEG, install
 
-CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"  # as pytorch.org has it
 _EXTRAS = {  # extra -> (the commands that need it, its packages)
     "sfm": ("cameras of photographs (gs2d reconstruct, poses)", ("pycolmap",)),
     "exr": ("OpenEXR photographs and depth maps", ("OpenEXR",)),
@@ -32,14 +31,12 @@ def doctor(_command: DoctorCommand, console: Console) -> None:
 
     host, installed, backends = machine(), versions(), backend_report()
     chosen = next((status.name for status in backends if status.available), "none")
-    optional, advice = _optional(), _torch_advice()
+    optional = _optional()
     console.say(f"{host['processor']}, {host['cores']} cores, {host['system']}")
     console.say(", ".join(f"{name} {version}" for name, version in installed.items()))
     console.heading(f"Rasterizers (--backend auto takes: {chosen})")
     for status in backends:
         _show(console, status.name, status.available, status.details or status.reason, status.remedy)
-    if advice:
-        console.say(advice)
     console.heading("For some commands")
     for entry in optional.values():
         _show(console, entry["used_by"], entry["available"], entry["details"], entry["remedy"])
@@ -49,7 +46,6 @@ def doctor(_command: DoctorCommand, console: Console) -> None:
             "machine": host,
             "versions": installed,
             "auto": chosen,
-            "advice": advice,
             "backends": [{field: getattr(status, field) for field in fields} for status in backends],
             "optional": optional,
         }
@@ -86,15 +82,3 @@ def _version(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _torch_advice() -> str:
-    """Return advice if torch was built for CUDA and there is no usable GPU, else ""."""
-    import torch
-
-    if torch.version.cuda is None or torch.cuda.is_available():
-        return ""
-    return (
-        f"torch was built for CUDA {torch.version.cuda} (gigabytes), and no GPU is usable. The CPU build is enough "
-        f"here; install it in a fresh environment: {CPU_TORCH}"
-    )
