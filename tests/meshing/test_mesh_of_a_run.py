@@ -30,12 +30,30 @@ from tiny import RADIUS, write_capture
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("run")
+    return trained(tmp_path_factory.mktemp("run"), "auto")
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with the protocol of photographs, whose meshes are refined."""
+    return trained(tmp_path_factory.mktemp("photographed"), "generic")
+
+
+def trained(folder: Path, protocol: str) -> Path:
     capture = write_capture(folder / "ball", size=32)
     overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
     out = folder / "run"
-    options = TrainOptions(scene=capture, out=out, recipe="2dgs", schedule_scale=0.002, overrides=overrides, threads=1)
-    return train(options).path
+    return train(
+        TrainOptions(
+            scene=capture,
+            out=out,
+            recipe="2dgs",
+            protocol=protocol,
+            schedule_scale=0.002,
+            overrides=overrides,
+            threads=1,
+        )
+    ).path
 
 
 def test_an_unbounded_mesh_of_a_run_reports_its_levels(run: Path, tmp_path: Path) -> None:
@@ -74,29 +92,33 @@ def test_training_with_little_memory_uses_larger_voxels(tmp_path: Path, monkeypa
     assert run.metrics()["mesh"]["faces"] == len(read_mesh(run.file("mesh.ply")).faces) > 10
 
 
-def test_a_refined_mesh_has_fewer_faces_and_counts_its_work(run: Path, tmp_path: Path) -> None:
-    plain = mesh_run(run, MeshOptions(voxel=0.03), out=tmp_path / "plain.ply", threads=1)
+def test_meshes_of_photographs_are_refined_and_those_of_data_sets_are_not(
+    run: Path, photographed: Path, tmp_path: Path
+) -> None:
     heard: list[Event] = []
-    refined = mesh_run(run, MeshOptions(voxel=0.03, refine=True), heard.append, out=tmp_path / "refined.ply", threads=1)
-    assert 20 < refined["faces"] < plain["faces"] / 2
-    assert len(read_mesh(tmp_path / "refined.ply").faces) == refined["faces"]
+    refined = mesh_run(photographed, MeshOptions(), heard.append, out=tmp_path / "refined.ply", threads=1)
+    assert len(read_mesh(tmp_path / "refined.ply").faces) == refined["faces"] > 20
+    mesh_run(photographed, MeshOptions(refine=False), out=tmp_path / "fused.ply", threads=1)
+    assert (tmp_path / "fused.ply").read_bytes() != (tmp_path / "refined.ply").read_bytes()
     begun = next(i for i, event in enumerate(heard) if isinstance(event, Phase) and event.name == "refining the mesh")
     work = [event.done for event in heard[begun:] if isinstance(event, Step)]
     assert work == sorted(work)
     assert work[-1] == heard[begun].total  # type: ignore[union-attr]
+    for options in (MeshOptions(), MeshOptions(refine=False)):
+        mesh_run(run, options, out=tmp_path / f"{options.refine}.ply", threads=1)
+    assert (tmp_path / "True.ply").read_bytes() == (tmp_path / "False.ply").read_bytes()
 
 
-def test_interrupting_a_refinement_keeps_the_mesh(run: Path) -> None:
-    mesh_run(run, MeshOptions(voxel=0.1), threads=1)
-    before = (run / "mesh.ply").read_bytes()
+def test_interrupting_a_refinement_keeps_the_mesh(photographed: Path) -> None:
+    before = (photographed / "mesh.ply").read_bytes()
 
     def interrupt(event: Event) -> None:
         if isinstance(event, Phase) and event.name == "refining the mesh":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        mesh_run(run, MeshOptions(voxel=0.1, refine=True), interrupt, threads=1)
-    assert (run / "mesh.ply").read_bytes() == before
+        mesh_run(photographed, MeshOptions(), interrupt, threads=1)
+    assert (photographed / "mesh.ply").read_bytes() == before
 
 
 def test_a_run_fuses_the_depth_of_its_protocol(run: Path, tmp_path: Path) -> None:

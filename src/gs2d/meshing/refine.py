@@ -181,7 +181,7 @@ class _Moving:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _ComparedView:
     """A photograph, the mesh in it, and its neighbours with the depth [h, w] of the mesh."""
 
     image: GreyImage
@@ -288,7 +288,7 @@ class Refinement:
         curvature = Curvature.of(now.vertices, now.faces, now.normals())
         bend = curvature.smooth(self._settings.smooth)
 
-        def views(surface: Surface) -> Iterator[_View]:
+        def views(surface: Surface) -> Iterator[_ComparedView]:
             for view in self._views(surface, cameras, photographs, neighbours):
                 yield view
                 self._done += self._cost(factor)
@@ -308,7 +308,7 @@ class Refinement:
         cameras: Sequence[Camera],
         photographs: Callable[[int], GreyImage],
         neighbours: Sequence[Sequence[int]],
-    ) -> Iterator[_View]:
+    ) -> Iterator[_ComparedView]:
         """Yield the views and their neighbours."""
         drawn = _Kept(lambda index: self._draw(surface.vertices, surface.faces, cameras[index]), self._room)
 
@@ -319,9 +319,9 @@ class Refinement:
         images = _Kept(usable, self._room)
         for index in range(len(cameras)):
             beside = [(images(other), drawn(other).depth) for other in neighbours[index]]
-            yield _View(images(index), drawn(index), beside)
+            yield _ComparedView(images(index), drawn(index), beside)
 
-    def _pulled(self, surface: Surface, views: Iterable[_View]) -> VertexPull:
+    def _pulled(self, surface: Surface, views: Iterable[_ComparedView]) -> VertexPull:
         """Return the derivatives of all pairs."""
         match, pull = self._settings.match, VertexPull.zeros(len(surface.vertices))
         for view in views:
@@ -332,7 +332,7 @@ class Refinement:
             gather_vertices(surface, camera, drawn.face, by_pixel, pull, match, self._library)
         return pull
 
-    def _kept(self, surface: Surface, views: Iterable[_View], curvature: Curvature) -> np.ndarray:
+    def _kept(self, surface: Surface, views: Iterable[_ComparedView], curvature: Curvature) -> np.ndarray:
         """Return the share of its move that each vertex keeps [P]: 1 on matt surface that photographs can compare."""
         settings, faces = self._settings, surface.faces
         sums = np.zeros((4, len(faces)))  # brightness and its weights, pixels that were compared and all pixels

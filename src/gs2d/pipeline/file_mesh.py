@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +61,6 @@ def mesh_file(
     """
     if out is None:
         raise RunError("--splats without a run needs --out FILE, the mesh to write")
-    if options.refine and cameras is None:
-        raise RunError("--refine compares photographs, got none; add --cameras CAPTURE, or leave --refine out")
     check_mesh_options(options)
     out = checked_mesh_file(Path(splats_file).parent, Path(out), options)
     check_writable(out)
@@ -72,6 +71,7 @@ def mesh_file(
         within(splats, options.bbox)
     if cameras is None:
         loaded, box = _around(splats, on_event)
+        options = replace(options, refine=False)  # there are no photographs
     else:
         loaded, box = _photographed(splats, Path(cameras), on_event), None
     subject = None

@@ -166,7 +166,9 @@ def fused(
 ) -> Extraction:
     """Fuse rendered depth of the training views; arguments as of :func:`extract_mesh`.
 
-    Without a voxel size, voxels are as large as memory requires.
+    Without a voxel size, voxels are as large as memory requires. Meshes of data sets stay as their protocols fuse them,
+    unbounded ones
+    too, whose distant faces are larger than any error of their depth, and watertight ones, so that they stay closed.
     """
     if not len(splats):
         raise ProtocolError("there are no splats to mesh; train longer or check the cameras")
@@ -205,7 +207,12 @@ def fused(
                 "the box"
             )
         on_event(Notice(line))
-    return replace(result, mesh=refined(loaded, result.mesh, on_event)) if options.refine else result
+    bounded = MESH_METHODS.get(options.method).bounded
+    if not options.refine or options.watertight or not bounded or not loaded.protocol.fusion.subject:
+        return result
+    mesh = refined(loaded, result.mesh, on_event)
+    cameras = [view.camera for view in loaded.scene.train]
+    return replace(result, mesh=simplify(mesh, error=_error(loaded, options), cameras=cameras))
 
 
 def check_mesh_options(options: MeshOptions) -> None:

@@ -268,8 +268,8 @@ class MeshOptions:
     """Mesh everything, not only the subject."""
     error: Annotated[float | None, Arg(metavar="PIXELS")] = None
     """Merge faces while the surface moves less than this in the nearest image (default: 0.25; data sets: keep all)."""
-    refine: bool = False
-    """Move the surface until neighbouring photographs agree, with fewer triangles."""
+    refine: bool = True
+    """Keep the fused surface, as for data sets; otherwise it moves until neighbouring photographs agree."""
     collision: bool = False
     """Also write convex pieces for collision tests: NAME-collision.obj beside the mesh (extra `collision`)."""
     lods: Annotated[int, SETTING] = 1
