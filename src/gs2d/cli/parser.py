@@ -25,12 +25,13 @@ _CAPTURE = ("", "the input is given without an option")
 _RUN = ("--out", "use --out for what the command writes")
 _SHORTER = ("--schedule-scale", "--schedule-scale 0.1 trains a tenth of the recipe's iterations")
 _SMALLER = ("--downscale", "--downscale 2 halves the photographs")
-_ELSEWHERE: dict[str, tuple[str, str]] = {  # option of other programs -> our option, advice
+_ELSEWHERE: dict[str, tuple[str, str]] = {  # option of other programs or earlier versions -> our option, advice
     **dict.fromkeys(("-s", "--source-path", "--data", "--data-dir", "--input", "-i"), _CAPTURE),
     **dict.fromkeys(("-m", "--model-path", "-o", "--output", "--output-dir", "--output-path", "--result-dir"), _RUN),
     **dict.fromkeys(("--iterations", "--iters", "--max-steps", "--num-iters", "--steps", "--total-steps"), _SHORTER),
     **dict.fromkeys(("-r", "--resolution", "--data-factor", "--images", "--downscale-factor"), _SMALLER),
     "--eval": ("--test-every", "--test-every 8 holds out every eighth photograph"),
+    "--refine": ("--no-refine", "meshes of photographs are refined without an option"),
 }
 _OUTPUTS = ("out", "video", "cache")  # paths that need not exist
 _EXPECTED = {
