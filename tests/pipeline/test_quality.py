@@ -2,8 +2,8 @@
 
 The demo with 24 photographs of 64x64. 2DGS-R at a fiftieth of the schedule (1200 iterations): seeds 0, 1 and 2 gave
 25.64, 25.72 and 25.68 dB on test views and F-scores of 0.406, 0.429 and 0.423 (middle threshold) and 0.724, 0.743 and
-0.748 (largest). `best` in half as many iterations: 26.03, 26.09 and 25.68 dB; 0.683, 0.697 and 0.691; 0.908, 0.913
-and 0.919.
+0.748 (largest). `best` in half as many iterations: 28.91, 28.64 and 28.28 dB; 0.782, 0.773 and 0.768; 0.921, 0.919
+and 0.912 (before the Mip filter 25.7 to 26.1 dB, 0.68 to 0.70).
 Who makes it better raises the floors.
 """
 
@@ -53,7 +53,7 @@ def test_the_number_of_splats(run: RunFolder) -> None:
 def test_the_default_recipe_is_better_with_half_of_the_iterations(best: RunFolder, run: RunFolder) -> None:
     (stage,) = best.metrics()["stages"]
     assert 2 * stage["iterations"] == sum(entry["iterations"] for entry in run.metrics()["stages"])
-    assert 25.5 <= stage["test"]["psnr"] <= 28, stage["test"]
+    assert 28.0 <= stage["test"]["psnr"] <= 30, stage["test"]
     f_scores = [entry["f_score"] for entry in best.metrics()["surface"]["thresholds"]]
-    assert f_scores[1] >= 0.66, f_scores
+    assert f_scores[1] >= 0.74, f_scores
     assert f_scores[2] >= 0.89, f_scores
