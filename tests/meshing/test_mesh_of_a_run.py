@@ -109,6 +109,15 @@ def test_meshes_of_photographs_are_refined_and_those_of_data_sets_are_not(
     assert (tmp_path / "True.ply").read_bytes() == (tmp_path / "False.ply").read_bytes()
 
 
+def test_a_mesh_of_the_whole_scene_says_what_can_vanish(photographed: Path, tmp_path: Path) -> None:
+    heard: list[Event] = []
+    options = MeshOptions(whole_scene=True, refine=False)
+    made = mesh_run(photographed, options, heard.append, out=tmp_path / "all.ply", threads=1)
+    (told,) = (event.text for event in heard if isinstance(event, Notice) and "vanish" in event.text)
+    assert told.startswith(f"what is thinner than {2 * made['truncation']:.2g} world units")
+    assert "--method unbounded" in told
+
+
 def test_interrupting_a_refinement_keeps_the_mesh(photographed: Path) -> None:
     before = (photographed / "mesh.ply").read_bytes()
 

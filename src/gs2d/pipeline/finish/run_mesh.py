@@ -166,9 +166,9 @@ def fused(
 ) -> Extraction:
     """Fuse rendered depth of the training views; arguments as of :func:`extract_mesh`.
 
-    Without a voxel size, voxels are as large as memory requires. Meshes of data sets stay as their protocols fuse them,
-    unbounded ones
-    too, whose distant faces are larger than any error of their depth, and watertight ones, so that they stay closed.
+    Without a voxel size, voxels are as large as memory requires. Then photographs refine the mesh. Meshes of data sets
+    stay as their protocols fuse them, unbounded ones too, whose distant faces are larger than any error of their depth,
+    and watertight ones, so that they stay closed.
     """
     if not len(splats):
         raise ProtocolError("there are no splats to mesh; train longer or check the cameras")
@@ -208,6 +208,9 @@ def fused(
             )
         on_event(Notice(line))
     bounded = MESH_METHODS.get(options.method).bounded
+    if options.whole_scene and bounded:
+        thin = f"{2 * result.limits.truncation:.2g}"  # nearer sides overwrite each other's distances
+        on_event(Notice(f"what is thinner than {thin} world units can vanish; --method unbounded has finer voxels nearby"))
     if not options.refine or options.watertight or not bounded or not loaded.protocol.fusion.subject:
         return result
     mesh = refined(loaded, result.mesh, on_event)
