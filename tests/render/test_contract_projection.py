@@ -245,7 +245,7 @@ def test_06_alpha_is_limited_and_the_limit_passes_gradients(backend: Backend) ->
 
 # 24 --------------------------------------------------------------------------------------------------------------
 def test_24_the_mip_filter_widens_a_splat_and_keeps_its_integral(backend: Backend) -> None:
-    # Standard deviations of 2 px on the screen become sqrt(4 + 1) px, and the opacity 4/5 of what it was.
+    # Standard deviations of 2 px on the screen become sqrt(4 + 1) px; the opacity is multiplied by 4/5.
     alpha = rasterize(splat(), front_camera(), RasterSettings(mip_px=1.0), backend=backend).alpha
     equal(alpha[4, 4:8], [0.5 * 4 / 5 * exp(-k * k / 10) for k in range(4)])
     # 0.25 px along y becomes sqrt(1 + 1/16) px.

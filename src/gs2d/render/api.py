@@ -301,7 +301,8 @@ def splat_sums(
 
     The weight of a splat in a pixel is w of rule 7, the factor of its colour. A blended image is linear
     in the colours, so these sums are the gradient of its scalar product with ``values``: one pass forward and back.
-    Divided by the weights, they are the mean of what a splat shows: labels or features of images lifted to splats.
+    Divided by the weights, they are the mean over the pixels that show a splat: so labels or features of images become
+    labels or features of splats.
 
     Parameters
     ----------
