@@ -210,7 +210,9 @@ def fused(
     bounded = MESH_METHODS.get(options.method).bounded
     if options.whole_scene and bounded:
         thin = f"{2 * result.limits.truncation:.2g}"  # nearer sides overwrite each other's distances
-        on_event(Notice(f"what is thinner than {thin} world units can vanish; --method unbounded has finer voxels nearby"))
+        on_event(
+            Notice(f"what is thinner than {thin} world units can vanish; --method unbounded is finer near cameras")
+        )
     if not options.refine or options.watertight or not bounded or not loaded.protocol.fusion.subject:
         return result
     mesh = refined(loaded, result.mesh, on_event)
