@@ -1,4 +1,4 @@
-"""``gs2d mesh RUN --method unbounded``: a tiny run meshed without bounds, and the messages."""
+"""``gs2d mesh RUN --scene``: a tiny run meshed without bounds, and the messages."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def trained(folder: Path, protocol: str) -> Path:
 
 
 def test_an_unbounded_mesh_of_a_run_reports_its_levels(run: Path, tmp_path: Path) -> None:
-    result = mesh_run(run, MeshOptions(method="unbounded", voxel=0.05), out=tmp_path / "far.ply", threads=1)
+    result = mesh_run(run, MeshOptions(whole_scene=True, voxel=0.05), out=tmp_path / "far.ply", threads=1)
     assert result["method"] == "unbounded"
     assert result["levels"] >= 1
     mesh = read_mesh(tmp_path / "far.ply")
@@ -107,15 +107,6 @@ def test_meshes_of_photographs_are_refined_and_those_of_data_sets_are_not(
     for options in (MeshOptions(), MeshOptions(refine=False)):
         mesh_run(run, options, out=tmp_path / f"{options.refine}.ply", threads=1)
     assert (tmp_path / "True.ply").read_bytes() == (tmp_path / "False.ply").read_bytes()
-
-
-def test_a_mesh_of_the_whole_scene_says_what_can_vanish(photographed: Path, tmp_path: Path) -> None:
-    heard: list[Event] = []
-    options = MeshOptions(whole_scene=True, refine=False)
-    made = mesh_run(photographed, options, heard.append, out=tmp_path / "all.ply", threads=1)
-    (told,) = (event.text for event in heard if isinstance(event, Notice) and "vanish" in event.text)
-    assert told.startswith(f"what is thinner than {2 * made['truncation']:.2g} world units")
-    assert "--method unbounded" in told
 
 
 def test_interrupting_a_refinement_keeps_the_mesh(photographed: Path) -> None:

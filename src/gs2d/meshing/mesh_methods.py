@@ -34,6 +34,15 @@ MESH_METHODS: Registry[MeshMethod] = Registry(
 )
 """Methods of mesh extraction, by name."""
 
+WHOLE = "unbounded"  # of the whole scene: with equal voxels thin things near the cameras would vanish
+
+
+def method_name(method: str, *, watertight: bool, whole_scene: bool) -> str:
+    """Return the name of the method that options ask for; only Delaunay tetrahedra close a surface."""
+    if watertight:
+        return "delaunay"
+    return WHOLE if whole_scene and method == "tsdf" and WHOLE in MESH_METHODS else method
+
 
 def register_mesh_method(name: str, *, bounded: bool = True) -> Callable[[Register], Register]:
     """Return a decorator that registers a method of mesh extraction, for ``gs2d mesh --method NAME``.

@@ -33,7 +33,7 @@ from gs2d.io.run_dir import (
 from gs2d.meshing.convex_pieces import convex_pieces, required
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, ExtractOptions
-from gs2d.meshing.mesh_methods import MESH_METHODS
+from gs2d.meshing.mesh_methods import MESH_METHODS, method_name
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
@@ -194,25 +194,17 @@ def fused(
             chosen = replace(chosen, voxel=error.voxel)
     if seen is not None:
         seen.spool.close()  # frees disk space
+    bounded = MESH_METHODS.get(_method_name(options)).bounded
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         part = f"{result.limits.cut_fraction:.0%} of the depth is"
-        if not MESH_METHODS.get(options.method).bounded:
+        if not bounded:
             limit = result.limits.depth_limit
             line = (
                 f"{part} beyond {limit:.4g} world units, where depth is too uncertain; --depth-limit extends the mesh"
             )
         else:
-            line = (
-                f"{part} outside the fused box; --method unbounded meshes everything, --bbox or --depth-limit extend "
-                "the box"
-            )
+            line = f"{part} outside the fused box; --scene meshes everything, --bbox or --depth-limit extend the box"
         on_event(Notice(line))
-    bounded = MESH_METHODS.get(options.method).bounded
-    if options.whole_scene and bounded:
-        thin = f"{2 * result.limits.truncation:.2g}"  # nearer sides overwrite each other's distances
-        on_event(
-            Notice(f"what is thinner than {thin} world units can vanish; --method unbounded is finer near cameras")
-        )
     if not options.refine or options.watertight or not bounded or not loaded.protocol.fusion.subject:
         return result
     mesh = refined(loaded, result.mesh, on_event)
@@ -280,7 +272,7 @@ def _extract(
 
 
 def _method_name(options: MeshOptions) -> str:
-    return "delaunay" if options.watertight else options.method
+    return method_name(options.method, watertight=options.watertight, whole_scene=options.whole_scene)
 
 
 def _error(loaded: RenderedScene, options: MeshOptions) -> float:

@@ -130,7 +130,7 @@ class CommonTraining:
     subject_box: BoxOption = None
     """Box of the subject, which is meshed (default: what most cameras look at)."""
     whole_scene: Annotated[bool, Arg(name="scene")] = False
-    """Mesh everything, not only the subject."""
+    """Mesh everything, not only the subject, in voxels that grow with distance."""
     masked: Literal["ignore", "empty", "off"] | None = None
     """Meaning of black mask pixels: ignore (not used), empty (transparent), or off (masks are not used) (default:
     ignore, or by protocol)."""
@@ -250,8 +250,7 @@ class MeshOptions:
     """How the surface is extracted. None: derived from the scene, or taken from the protocol of the run."""
 
     method: Annotated[str, Arg(metavar="METHOD")] = "tsdf"
-    """tsdf fuses the depth maps in voxels. delaunay cuts tetrahedra: fewer false pieces, but thin parts are lost.
-    unbounded meshes distant things too, in voxels that grow with distance."""
+    """tsdf fuses the depth maps in voxels. delaunay cuts tetrahedra: fewer false pieces, but thin parts are lost."""
     watertight: bool = False
     """Close the surface where no photograph shows it, too. Implies --method delaunay."""
     voxel: float | None = None
@@ -261,11 +260,11 @@ class MeshOptions:
     depth_limit: Annotated[float | None, SETTING] = None
     """Ignore depth beyond this, in world units (default: from the scene)."""
     bbox: BoxOption = None
-    """Mesh this box instead of the subject. With --method unbounded: the box of the finest voxels."""
+    """Mesh this box instead of the subject. With --scene: the box of the finest voxels."""
     subject_box: BoxOption = None
     """Box of the subject, from now on (default: that of the run, or what most cameras look at)."""
     whole_scene: Annotated[bool, Arg(name="scene")] = False
-    """Mesh everything, not only the subject."""
+    """Mesh everything, not only the subject, in voxels that grow with distance."""
     error: Annotated[float | None, Arg(metavar="PIXELS")] = None
     """Merge faces while the surface moves less than this in the nearest image (default: 0.25; data sets: keep all)."""
     refine: bool = True
