@@ -7,8 +7,8 @@
 
 The scene is a sphere of radius 0.9 with coloured waves, viewed from all sides; its surface is about as large as that of
 ``rendered_bottle``. With ``--unbounded`` the same frames are fused into nested levels; the innermost level has half the
-side of the sphere and the voxel size of the bounded run. ``--backend reference`` fuses in numpy, ``cpu`` natively,
-``cuda`` on a GPU. Compare CPU times on a shared machine.
+side of the sphere and the voxel size of the bounded run. ``--backend cuda`` fuses on a GPU. Compare CPU times on a
+shared machine.
 """
 
 from __future__ import annotations
@@ -103,13 +103,13 @@ def run(
     if unbounded:
         core = np.array([[-RADIUS] * 3, [RADIUS] * 3]) / 2
         cascade = derive_cascade(samples, cameras, bbox=core, voxel=limits.voxel, truncation=limits.truncation)
-        levels = timed("blocks", lambda: find_cascade_blocks(maps, cascade, threads=threads, backend=backend))
+        levels = timed("blocks", lambda: find_cascade_blocks(maps, cascade, threads=threads))
         mesh = timed(
             "fuse",
             lambda: fused_cascade_surface(maps, cascade, levels, far_weight=1.0, threads=threads, backend=backend),
         )
     else:
-        levels = timed("blocks", lambda: (find_blocks(maps, limits, threads=threads, backend=backend),))
+        levels = timed("blocks", lambda: (find_blocks(maps, limits, threads=threads),))
         volume = timed("fuse", lambda: fuse_blocks(maps, limits, levels[0], threads=threads, backend=backend))
         mesh = timed("marching cubes", lambda: marching_cubes(volume))
     mesh = timed("components", lambda: keep_components(mesh))
@@ -140,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--resolution", type=int, default=512)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--unbounded", action="store_true")
-    parser.add_argument("--backend", default="auto", choices=("auto", "cpu", "cuda", "reference"))
+    parser.add_argument("--backend", default="auto", choices=("auto", "cpu", "cuda"))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     result = run(

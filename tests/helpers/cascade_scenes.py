@@ -63,7 +63,7 @@ def fused_levels(
     slab_bytes: int = 1 << 40,
 ) -> Mesh:
     """Fuse depth maps into all levels and extract their surface."""
-    blocks = find_cascade_blocks(maps, cascade, threads=threads, backend=backend)
+    blocks = find_cascade_blocks(maps, cascade, threads=threads)
     return fused_cascade_surface(
         maps, cascade, blocks, far_weight=1.0, slab_bytes=slab_bytes, threads=threads, backend=backend
     )

@@ -15,7 +15,6 @@ from gs2d.core.json_files import write_json
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
-from gs2d.kernels.library import available_variants
 from gs2d.meshing.tsdf_volume import Add, Volume, integrator
 from gs2d.pipeline.finish.run_mesh import extract_mesh, mesh_run
 from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
@@ -143,7 +142,9 @@ def test_a_run_fuses_the_depth_of_its_protocol(run: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("method", ["tsdf", "unbounded"])
-def test_a_run_is_fused_by_its_backend(run: Path, tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_without_a_gpu_is_fused_by_the_cpu(
+    run: Path, tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[str] = []
 
     def recorded(
@@ -154,10 +155,10 @@ def test_a_run_is_fused_by_its_backend(run: Path, tmp_path: Path, method: str, m
 
     job, splats = reload_run(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
     monkeypatch.setattr("gs2d.meshing.tsdf_volume.integrator", recorded)
-    for backend in ("reference", *(["cpu"] if available_variants() else [])):
+    for backend in ("reference", "cpu"):
         options = MeshOptions(method=method, voxel=0.05)
         result = extract_mesh(
             replace(job, backend=get_backend(backend)), splats, options, tmp_path / "mesh.ply", lambda _event: None
         )
-        assert result["fused_by"] == backend == asked.pop()
+        assert result["fused_by"] == asked.pop() == "cpu"
     assert not asked

@@ -1,5 +1,4 @@
-"""Simplification keeps the surface within an error in pixels, its outline and its colours, and gives the same bits in
-Python and natively."""
+"""Simplification keeps the surface within an error in pixels, its outline and its colours."""
 
 from __future__ import annotations
 
@@ -11,7 +10,6 @@ import pytest
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
-from gs2d.meshing import simplify as module
 from gs2d.meshing.simplify import pixel_scale, simplify
 
 
@@ -47,30 +45,6 @@ def camera(distance: float, focal: float = 400.0) -> Camera:
 def edge_counts(mesh: Mesh) -> np.ndarray:
     edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
     return np.unique(edges, axis=0, return_counts=True)[1]
-
-
-def in_python(mesh: Mesh, monkeypatch: pytest.MonkeyPatch, **options: object) -> Mesh:
-    with monkeypatch.context() as patched:
-        patched.setattr(module, "collapse_natively", lambda arrays, rules: False)
-        return simplify(mesh, **options)
-
-
-@pytest.mark.parametrize("painted", [False, True])
-def test_python_and_native_code_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, painted: bool) -> None:
-    colors = np.random.default_rng(0).integers(0, 256, (400, 3), np.uint8) if painted else None
-    rough = sheet(20, colors=colors)
-    rough.vertices[:, 2] += np.random.default_rng(1).normal(0, 0.002, 400)
-    for mesh, options in (
-        (rough, {"cameras": [camera(2.0)], "error": 1.0}),
-        (rough, {"faces": 90}),
-        (dataclasses.replace(rough, faces=rough.faces[::3]), {"faces": 40}),  # open edges everywhere
-        (ball(12), {"faces": 60}),
-    ):
-        native, reference = simplify(mesh, **options), in_python(mesh, monkeypatch, **options)
-        assert len(native.faces) < len(mesh.faces)
-        assert native.vertices.tobytes() == reference.vertices.tobytes()
-        assert native.faces.tobytes() == reference.faces.tobytes()
-        assert painted is False or mesh.colors is None or native.colors.tobytes() == reference.colors.tobytes()
 
 
 @pytest.mark.parametrize("error", [0.25, 1.0])

@@ -26,7 +26,7 @@ LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "
 FOLDER = Path(__file__).parent / "lib"
 REMEDY = (
     "install a C++20 compiler (g++ >= 12 or clang++ >= 14) and run `pip install --force-reinstall --no-deps .` "
-    "(in a source checkout: `make kernels`), or use --backend reference"
+    "(in a source checkout: `make kernels`); --backend reference trains without it, slowly and without a mesh"
 )
 
 

@@ -1,4 +1,4 @@
-"""Native edge collapse; ``meshing/simplify.py`` has the same in Python."""
+"""Native edge collapse for ``meshing/simplify.py``."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gs2d.errors import BackendError
 from gs2d.kernels.library import load
 
-__all__ = ["CollapseArrays", "CollapseRules", "collapse_natively"]
+__all__ = ["CollapseArrays", "CollapseRules", "collapse"]
 
 _CANDIDATE_BYTES = 24  # of cpu/collapse.cpp
 _RULES = ("target", "limit", "length_weight", "tint_weight", "border_weight", "turn", "pull")
@@ -92,18 +91,9 @@ class _CollapseArguments(ctypes.Structure):
     )
 
 
-def collapse_natively(arrays: CollapseArrays, rules: CollapseRules) -> bool:
-    """Collapse edges in place, with 180 bytes per face of temporary memory.
-
-    Returns
-    -------
-    bool
-        False without the native library; nothing is done then.
-    """
-    try:
-        library = load()
-    except BackendError:
-        return False
+def collapse(arrays: CollapseArrays, rules: CollapseRules) -> None:
+    """Collapse edges in place, with 180 bytes per face of temporary memory."""
+    library = load()
     count, faces = len(arrays.points), len(arrays.corners)
     capacity = 3 * faces  # edges of separate triangles
     work = {name: np.empty(count, np.int32) for name in ("head", "tail", "stamp", "mark")}
@@ -114,4 +104,3 @@ def collapse_natively(arrays: CollapseArrays, rules: CollapseRules) -> bool:
     rules_of = dict(zip(_RULES, rules, strict=True))
     arguments = _CollapseArguments(vertices=count, faces=faces, capacity=capacity, **rules_of, **pointers)
     library.function("gs2d_collapse", None, [ctypes.c_void_p])(ctypes.byref(arguments))
-    return True

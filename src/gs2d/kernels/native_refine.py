@@ -1,4 +1,4 @@
-"""Native kernels of mesh refinement: ``meshing/warped_ncc.py`` has the same in numpy and describes the arrays."""
+"""Native kernels of mesh refinement; ``meshing/warped_ncc.py`` describes the arrays."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Adding one depth map to a volume, natively and on a GPU: the formulas are in ``kernels/core/fuse.h``.
 
-Shapes and types are those of ``meshing/tsdf_volume.py``, the only caller, which has the same in numpy.
+Shapes and types are those of ``meshing/tsdf_volume.py``, the only caller.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = [
     "FuseArguments",
     "FusionOnDevice",
-    "FusionOnHost",
     "arguments_of",
     "fuse_on_cpu",
     "fuse_on_gpu",
@@ -32,13 +31,6 @@ __all__ = [
 
 VOXELS = 512  # per block
 THREADS = 128  # per CUDA block, fuse.cu
-
-
-@dataclass(frozen=True)
-class FusionOnHost:
-    """Fusion by a native library, into volumes in host memory."""
-
-    library: Library
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def extract_delaunay(
         As for ``extract``.
     """
     backend = fusion_backend(backend)
-    library = _library(backend)
+    library = optional_library()
     with Spool.of(frames) as spool:
         if len(spool) < 2:
             raise ProtocolError(f"a mesh by Delaunay needs two or more views, got {len(spool)}; use --method tsdf")
@@ -115,11 +115,6 @@ def extract_delaunay(
         mesh = simplify(mesh, error=options.error, cameras=spool.cameras)
         volume_bytes = max(volume_bytes, BYTES_A_POINT * len(points.xyz))
         return Extraction(mesh, limits, len(spool), volume_bytes, 1, backend.name, pixels)
-
-
-def _library(backend: Backend) -> Library | None:
-    """Return the native library; None for a backend that fuses in numpy, or if it was not built."""
-    return None if backend.fusion() is None else optional_library()
 
 
 def _points(fused: Mesh, spool: Spool, limits: FusionBounds, options: ExtractOptions) -> OrientedPoints:

@@ -138,7 +138,7 @@ def fused_depths(
 ) -> tuple[Mesh, int]:
     """Return the surface of all components in the fused volume, and the bytes of the volume."""
     trim()  # returns 20 to 60 MB before the volume is allocated
-    blocks = find_blocks(spool, limits, max_bytes=options.max_bytes, threads=threads, backend=backend)
+    blocks = find_blocks(spool, limits, max_bytes=options.max_bytes, threads=threads)
     mesh = fused_surface(
         spool,
         limits,

@@ -201,8 +201,7 @@ class Refinement:
     photographs : callable
         Reads a photograph in grey.
     settings : RefineSettings
-    library : Library or None
-        Native kernels; None: numpy.
+    library : Library
 
     Attributes
     ----------
@@ -215,8 +214,8 @@ class Refinement:
         mesh: Mesh,
         cameras: Sequence[Camera],
         photographs: ReadGrey,
-        settings: RefineSettings = RefineSettings(),
-        library: Library | None = None,
+        settings: RefineSettings,
+        library: Library,
     ) -> None:
         self._mesh, self._cameras, self._photographs = mesh, list(cameras), photographs
         self._settings, self._library = settings, library
@@ -277,7 +276,7 @@ class Refinement:
         return gather(mesh, maps(), self._settings.match.occluded * float(np.median(depths or [0.0])))
 
     def _draw(self, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> DrawnMesh:
-        return draw_mesh(vertices, faces, camera, library=self._library)
+        return draw_mesh(vertices, faces, camera, self._library)
 
     def _at_size(
         self, now: _Moving, factor: int, neighbours: Sequence[Sequence[int]], on_work: Callable[[int], None]
@@ -328,7 +327,7 @@ class Refinement:
             camera, drawn = view.image.camera, view.drawn
             by_pixel = PixelPull.zeros(camera, drawn.depth.dtype)
             for other, depth in view.neighbours:
-                match_views(view.image, other, drawn.depth, depth, match, by_pixel, library=self._library)
+                match_views(view.image, other, drawn.depth, depth, match, by_pixel, self._library)
             gather_vertices(surface, camera, drawn.face, by_pixel, pull, match, self._library)
         return pull
 
@@ -340,9 +339,7 @@ class Refinement:
             drawn = view.drawn
             at = drawn.face >= 0
             for other, depth in view.neighbours:
-                share, weight = brightness_share(
-                    view.image, other, drawn.depth, depth, settings.match, library=self._library
-                )
+                share, weight = brightness_share(view.image, other, drawn.depth, depth, settings.match, self._library)
                 compared = ~np.isnan(share)
                 for total, values in zip(sums, (np.nan_to_num(share) * weight, weight, compared, at), strict=True):
                     total += np.bincount(drawn.face[at], values[at], len(faces))
@@ -380,7 +377,7 @@ def coarse_to_fine(cameras: Sequence[Camera], side: int) -> tuple[int, ...]:
 
 # -- neighbours --------------------------------------------------------------------------------------------------------
 def choose_neighbours(
-    mesh: Mesh, cameras: Sequence[Camera], settings: RefineSettings, library: Library | None
+    mesh: Mesh, cameras: Sequence[Camera], settings: RefineSettings, library: Library
 ) -> list[tuple[int, ...]]:
     """Return for each camera those that see its part of the mesh at good angles.
 
@@ -388,7 +385,7 @@ def choose_neighbours(
     points that earlier neighbours see count less.
     """
     small = [camera.downscaled(max(1, min(camera.width, camera.height) // SMALL_SIDE)) for camera in cameras]
-    drawn = [draw_mesh(mesh.vertices, mesh.faces, camera, library=library) for camera in small]
+    drawn = [draw_mesh(mesh.vertices, mesh.faces, camera, library) for camera in small]
     found = []
     for index, camera in enumerate(small):
         points, normals = _sampled(mesh, camera, drawn[index])

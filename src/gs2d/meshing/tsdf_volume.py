@@ -11,30 +11,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 import numpy as np
+import torch
 
 from gs2d.errors import ProtocolError
-from gs2d.kernels.tsdf import FusionOnHost
+from gs2d.kernels.library import Library, load
+from gs2d.kernels.tsdf import FusionOnDevice, arguments_of, fuse_on_cpu, fuse_on_gpu, mark_on_cpu
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.fusion_bounds import FusionBounds, backproject
 from gs2d.meshing.sampling import DepthSampler, block_visibility, make_sampler, may_see
 from gs2d.render.backends import Backend, get_backend
 
-if TYPE_CHECKING:
-    import torch
-
-    from gs2d.kernels.cuda.launch import Launcher
-    from gs2d.kernels.library import Library
-
-
 # -- the volume --------------------------------------------------------------------------------------------------------
 BLOCK = 8  # voxels along the side of a block
 VOXELS = BLOCK**3
+MAX_BLOCKS = 2**32  # of a box; finding the touched ones needs a byte of address space for each
 _ALL_OF_LEAST = 16  # all blocks of a scene / lower bound for one view; 5 to 15 in measured scenes
 
 
@@ -117,11 +112,11 @@ def block_grid(limits: FusionBounds) -> tuple[int, int, int]:
     Raises
     ------
     ProtocolError
-        If the voxel is so small that the blocks cannot be numbered.
+        If the box has more than ``MAX_BLOCKS`` blocks.
     """
     size = np.subtract(limits.upper, limits.lower)
     dims = np.ceil(size / (BLOCK * limits.voxel)) + 1
-    if not np.isfinite(dims).all() or np.prod(dims) > 2**60:
+    if not np.isfinite(dims).all() or np.prod(dims) > MAX_BLOCKS:
         raise ProtocolError(
             f"the voxel is too small for a box of {size.max():.4g} world units, got {limits.voxel:.4g}; increase it"
         )
@@ -174,22 +169,21 @@ class Budget:
 
 
 # -- one view ----------------------------------------------------------------------------------------------------------
-# The backend selects one of three implementations; numpy is the reference and runs everywhere.
 FULL_WEIGHT_BEHIND = 0.75  # of the truncation: the weight falls from 1 here to 0 at the truncation
-_CHUNK = 48  # blocks at a time in numpy: the temporaries of a chunk fit the second-level cache
 
 Add = Callable[[DepthSampler], None]
 
 
 def fusion_backend(backend: str | Backend) -> Backend:
-    """Return the backend of the fusion: "auto" is the native CPU library if it is built, else numpy.
+    """Return the backend of the fusion: "cpu" for "auto", and for a backend without fusion of its own.
 
     Raises
     ------
     BackendError
         If the name is unknown or the backend cannot run here.
     """
-    return get_backend(backend, "cpu") if isinstance(backend, str) else backend
+    chosen = get_backend("cpu" if backend == "auto" else backend) if isinstance(backend, str) else backend
+    return get_backend("cpu") if chosen.fusion() is None else chosen
 
 
 def integrator(
@@ -210,13 +204,15 @@ def integrator(
     BackendError
         If the backend is unknown or cannot run here.
     """
-    threads = threads or os.cpu_count() or 1
-    fusion = fusion_backend(backend).fusion()
-    if fusion is None:
-        return add_in_numpy(volumes, threads)
-    if isinstance(fusion, FusionOnHost):
-        return add_natively(volumes, fusion.library, threads)
-    return add_on_gpu(volumes, fusion.launcher, fusion.device)
+    device = fusion_backend(backend).fusion()
+    return add_natively(volumes, threads) if device is None else add_on_gpu(volumes, device)
+
+
+def native_library(threads: int | None) -> Library:
+    """Return the native library, set to a number of threads (default: all cores)."""
+    library = load()
+    library.use_threads(threads or os.cpu_count() or 1)
+    return library
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,83 +256,12 @@ def _change(grid: _Grid, view: DepthSampler) -> _Change:
 
 
 @contextmanager
-def add_in_numpy(volumes: Sequence[Volume], threads: int) -> Iterator[Add]:
-    """Add views with numpy: the reference implementation."""
-    grids = _grids(volumes)
-    with ThreadPoolExecutor(threads) as pool:
-
-        def add(view: DepthSampler) -> None:
-            for grid in grids:
-                change = _change(grid, view)
-                starts = range(0, len(change.rows), _CHUNK)
-                chunks = [
-                    replace(change, rows=change.rows[i : i + _CHUNK], bases=change.bases[i : i + _CHUNK])
-                    for i in starts
-                ]
-                for done in pool.map(lambda chunk, volume=grid.volume: _add_chunk(volume, view, chunk), chunks):
-                    assert done is None  # consuming the map raises exceptions of threads
-
-        yield add
-
-
-def _add_chunk(volume: Volume, view: DepthSampler, chunk: _Change) -> None:
-    """Add one view to a chunk of blocks; chunks share no block, so threads do not conflict."""
-    rows, bases, offsets = chunk.rows, chunk.bases, chunk.offsets
-    truncation = np.float32(volume.limits.truncation)
-    z = bases[:, 2:] + offsets[2]  # [n, 512]
-    x = (bases[:, :1] + offsets[0]) / z
-    y = (bases[:, 1:2] + offsets[1]) / z
-    distance, pixel = view.signed_distance(x, y, z)  # large and negative at invalid pixels
-    distance /= truncation
-    weight = (distance + np.float32(1)) / np.float32(1 - FULL_WEIGHT_BEHIND)
-    np.clip(weight, 0, 1, out=weight)
-    if view.weight is not None:
-        weight *= view.weight[pixel]
-    if volume.color is not None and volume.color_weight is not None and view.color is not None:
-        _blend_colors(volume.color, volume.color_weight, view, rows, distance, weight, pixel)
-    np.minimum(distance, 1, out=distance)
-    old = volume.weight[rows]
-    total = old + weight
-    tsdf = volume.tsdf[rows]
-    step = weight / np.maximum(total, np.float32(1e-20))
-    distance -= tsdf
-    distance *= step
-    tsdf += distance
-    volume.tsdf[rows] = tsdf
-    volume.weight[rows] = total
-
-
-def _blend_colors(
-    color: np.ndarray,
-    color_weight: np.ndarray,
-    view: DepthSampler,
-    rows: np.ndarray,
-    distance: np.ndarray,
-    weight: np.ndarray,
-    pixel: np.ndarray,
-) -> None:
-    """Update the mean colour of the voxels near the surface of this view, weighted by their distance."""
-    assert view.color is not None
-    near = np.flatnonzero((weight > 0) & (distance < 1))  # flat index in the chunk
-    flat = rows[near >> 9] * VOXELS + (near & (VOXELS - 1))
-    w = weight.reshape(-1)[near] * (1 - np.abs(distance.reshape(-1)[near]))
-    colors, weights = color.reshape(-1, 3), color_weight.reshape(-1)
-    total = weights[flat] + w
-    old = colors[flat]
-    old += (view.color[pixel.reshape(-1)[near]] - old) * (w / np.maximum(total, np.float32(1e-20)))[:, None]
-    colors[flat] = old
-    weights[flat] = total
-
-
-@contextmanager
-def add_natively(volumes: Sequence[Volume], library: Library, threads: int) -> Iterator[Add]:
+def add_natively(volumes: Sequence[Volume], threads: int | None) -> Iterator[Add]:
     """Add views with the native CPU library."""
-    from gs2d.kernels.tsdf import arguments_of, fuse_on_cpu
-
     grids = _grids(volumes)
 
     def add(view: DepthSampler) -> None:
-        library.use_threads(threads)
+        library = native_library(threads)
         for grid in grids:
             volume, change = grid.volume, _change(grid, view)
             arrays = _view_arrays(view, colored=volume.color is not None)
@@ -348,14 +273,11 @@ def add_natively(volumes: Sequence[Volume], library: Library, threads: int) -> I
 
 
 @contextmanager
-def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.device) -> Iterator[Add]:
+def add_on_gpu(volumes: Sequence[Volume], gpu: FusionOnDevice) -> Iterator[Add]:
     """Add views on a GPU: the volumes stay there until the end; each view and its blocks are copied there."""
-    import torch
-
-    from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
 
     def to_device(arrays: dict[str, np.ndarray | None]) -> dict[str, torch.Tensor | None]:
-        return {name: None if a is None else torch.from_numpy(a).to(device) for name, a in arrays.items()}
+        return {name: None if a is None else torch.from_numpy(a).to(gpu.device) for name, a in arrays.items()}
 
     grids = _grids(volumes)
     held = [to_device(_volume_arrays(grid.volume)) for grid in grids]
@@ -367,7 +289,7 @@ def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.devi
             change = _change(grid, view)
             blocks = to_device({"rows": change.rows, "bases": change.bases, "offsets": change.offsets})
             size, truncation = (view.height, view.width), grid.volume.limits.truncation
-            fuse_on_gpu(launcher, arguments_of(size, truncation, image | blocks | volume))
+            fuse_on_gpu(gpu.launcher, arguments_of(size, truncation, image | blocks | volume))
 
     yield add
     for grid, tensors in zip(grids, held, strict=True):
@@ -389,7 +311,6 @@ def _volume_arrays(volume: Volume) -> dict[str, np.ndarray | None]:
 
 
 # -- all views ---------------------------------------------------------------------------------------------------------
-_MAX_MARKS = 1 << 27  # bytes
 _FEW_SAMPLES = 1e8  # of one depth map; takes seconds
 
 
@@ -413,7 +334,7 @@ def fuse(
     threads : int, optional
         Default: all cores. The result does not depend on it.
     backend : str or Backend
-        "reference" (numpy), "cpu" (native, bit-identical), "cuda", or "auto" (see ``fusion_backend``).
+        "cuda", or the native CPU library: "cpu" and every other name.
 
     Raises
     ------
@@ -423,7 +344,7 @@ def fuse(
     BackendError
         If the backend is unknown or cannot run here.
     """
-    blocks = find_blocks(frames, limits, max_bytes=max_bytes, threads=threads, backend=backend)
+    blocks = find_blocks(frames, limits, max_bytes=max_bytes, threads=threads)
     return fuse_blocks(frames, limits, blocks, threads=threads, backend=backend)
 
 
@@ -462,7 +383,6 @@ def find_blocks(
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    backend: str | Backend = "auto",
 ) -> VolumeBlocks:
     """Find the blocks to fuse; parameters and errors as for ``fuse``."""
     if iter(frames) is frames:
@@ -471,11 +391,11 @@ def find_blocks(
     dims = block_grid(limits)
     budget = Budget(limits, max_bytes)
     keys = np.zeros(0, dtype=np.int64)
-    colored, count, library = False, 0, block_finder(backend, threads)
+    colored, count = False, 0
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
         budget.check_least(min_blocks(item, limits), colored)
-        keys = merged(keys, touched_blocks(item, limits, dims, library))
+        keys = merged(keys, touched_blocks(item, limits, dims, threads))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
@@ -551,13 +471,13 @@ def _samples(item: DepthMap, depth: np.ndarray, limits: FusionBounds) -> tuple[i
 
 
 def touched_blocks(
-    item: DepthMap, limits: FusionBounds, dims: tuple[int, int, int], library: Library | None = None
+    item: DepthMap, limits: FusionBounds, dims: tuple[int, int, int], threads: int | None = None
 ) -> np.ndarray:
     """Return the sorted keys [K] of the blocks near the surface of one depth map.
 
     Each valid pixel is sampled along its ray from one truncation in front of the surface to one behind it, in steps of
     half a block; a sample touches the nearest 2^3 blocks. Pixels wider than half a block are sampled at several
-    positions. The native library performs the same operations as numpy.
+    positions.
     """
     half = 0.5 * BLOCK * limits.voxel
     rows, columns = np.nonzero((item.depth > 0) & (item.depth <= limits.depth_limit))
@@ -572,61 +492,21 @@ def touched_blocks(
     strides = (padded[1] * padded[2], padded[2], 1)
     start = (item.camera.center - limits.lower) / half  # in half blocks, as everything below
     end = 2 * np.asarray(dims)
-    rays = (
-        (backproject(item.camera, np.ones(len(rows)), rows + dy, columns + dx) - item.camera.center).T / half
-        for dx in shifts
-        for dy in shifts
-    )
-    if library is not None and padded[0] * padded[1] * padded[2] <= _MAX_MARKS:
-        from gs2d.kernels.tsdf import mark_on_cpu
-
-        marks = np.zeros(padded, bool)
-        for ray in rays:
+    marks = np.zeros(padded, bool)
+    library = native_library(threads)
+    for dx in shifts:
+        for dy in shifts:
+            ends = backproject(item.camera, np.ones(len(rows)), rows + dy, columns + dx)
+            ray = (ends - item.camera.center).T / half
             mark_on_cpu(library, ray, depth, offsets, start, end, marks)
-        first = np.flatnonzero(marks)
-    else:
-        lowest = [part for ray in rays for part in _lowest_blocks(ray, depth, offsets, start, end, strides)]
-        first = _distinct(lowest, padded)
+    first = np.flatnonzero(marks)
     corners = [sum(strides[axis] * (c >> axis & 1) for axis in range(3)) for c in range(8)]
-    blocks = np.stack(np.unravel_index(_distinct([first + corner for corner in corners], padded), padded)) - 1
+    touched = marks.reshape(-1)
+    for corner in corners:
+        touched[first + corner] = True
+    blocks = np.stack(np.unravel_index(np.flatnonzero(touched), padded)) - 1
     x, y, z = blocks[:, ((blocks >= 0) & (blocks < np.asarray(dims)[:, None])).all(axis=0)]
     return (x * dims[1] + y) * dims[2] + z
-
-
-def _lowest_blocks(
-    ray: np.ndarray, depth: np.ndarray, offsets: np.ndarray, start: np.ndarray, end: np.ndarray, strides: Sequence[int]
-) -> Iterator[np.ndarray]:
-    """Yield, for each offset, the blocks that contain ``start + (depth + offset) ray``, inside the grid."""
-    for offset in offsets:
-        at = start[:, None] + (depth + offset) * ray  # [3, P]
-        cells = at[:, ((at >= 0) & (at < end[:, None])).all(axis=0)].astype(np.int64)
-        x, y, z = (cells + 1) >> 1
-        flat = x * strides[0] + y * strides[1] + z
-        yield flat[np.flatnonzero(np.diff(flat, prepend=-1))]  # neighbours mostly share a block
-
-
-def block_finder(backend: str | Backend, threads: int | None) -> Library | None:
-    """Return the native library for ``touched_blocks``; None (numpy) for the reference backend."""
-    if fusion_backend(backend).fusion() is None:
-        return None
-    from gs2d.kernels.library import available_variants, load
-
-    if not available_variants():
-        return None
-    library = load()
-    library.use_threads(threads or os.cpu_count() or 1)
-    return library
-
-
-def _distinct(numbers: list[np.ndarray], dims: tuple[int, int, int]) -> np.ndarray:
-    """Return the sorted distinct cell numbers of a grid, by marking cells, or by sorting if the grid is too large."""
-    cells = dims[0] * dims[1] * dims[2]
-    if cells > _MAX_MARKS:
-        return np.unique(np.concatenate(numbers))
-    marks = np.zeros(cells, bool)
-    for some in numbers:
-        marks[some] = True
-    return np.flatnonzero(marks)
 
 
 def merged(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ pixels of a window compares a and b, and the energy is
 
 where ``trust`` rises from 0 at ``poor`` to 1 at ``good`` (occlusions, reflections and moving things have none) and
 ``texture`` is v / (v + ``texture``), v the smaller variance. Weights are constant in the derivative. Formulas:
-docs/math.md, "Mesh refinement". The native version, ``kernels/cpu/refine.cpp``, is used if its library is passed.
+docs/math.md, "Mesh refinement"; code: ``kernels/cpu/refine.cpp``.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ from gs2d.kernels.native_refine import (
     lens_of,
     match_on_cpu,
 )
-from gs2d.meshing.raycast import NEAR, cast_camera, outlines
+from gs2d.meshing.raycast import NEAR, outlines
 
-MIN_SCALE = 0.1  # depth in the neighbour / depth in the view; as in kernels/cpu/refine.cpp
 OUTLINE = 2  # px on both sides of an outline that are ignored
 ENOUGH = 0.5  # fraction of a window that must be visible in both images
 DARK = 0.02  # grey value below which the brightness of two images is not compared
@@ -162,7 +161,7 @@ class VertexPull:
 
 
 def draw_mesh(
-    vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, near: float = NEAR, library: Library | None = None
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, library: Library, *, near: float = NEAR
 ) -> DrawnMesh:
     """Draw the depth of a mesh.
 
@@ -171,15 +170,11 @@ def draw_mesh(
     vertices : ndarray [P, 3] float64 world units
     faces : ndarray [F, 3] int32
     camera : Camera
+    library : Library
     near : float, world units
         Nearer faces are left out.
-    library : Library or None
-        None: by ray casting, in numpy.
     """
-    if library is not None:
-        return DrawnMesh(*draw_on_cpu(library, vertices, faces, camera, near))
-    hits = cast_camera(vertices, faces, camera, near=near)
-    return DrawnMesh(hits.face, hits.depth)
+    return DrawnMesh(*draw_on_cpu(library, vertices, faces, camera, near))
 
 
 def match_views(
@@ -189,9 +184,8 @@ def match_views(
     other_depth: np.ndarray,
     settings: MatchSettings,
     into: PixelPull,
-    *,
-    library: Library | None = None,
-) -> None:
+    library: Library,
+) -> np.ndarray:
     """Compare a view with a neighbour and add the derivatives by the depth of its pixels to ``into``.
 
     Parameters
@@ -201,25 +195,15 @@ def match_views(
         Depth of the mesh in both; 0 without a surface.
     settings : MatchSettings
     into : PixelPull
-    library : Library or None
-        None: in numpy. The arrays have its precision.
+    library : Library
+        The arrays have its precision.
+
+    Returns
+    -------
+    ndarray [7, H, W]
+        The workspace, with the warped neighbour at ``WARPED`` and where it is visible at ``VISIBLE``.
     """
-    if library is None:
-        _match(view, other, depth, other_depth, settings, into)
-    else:
-        _match_natively((view, other), (depth, other_depth), settings, into, library)
-
-
-def _match_natively(
-    pair: tuple[GreyImage, GreyImage],
-    depths: tuple[np.ndarray, np.ndarray],
-    settings: MatchSettings,
-    into: PixelPull,
-    library: Library,
-) -> np.ndarray:
-    """Call the kernel; return its workspace [7, H, W], which begins with the warped neighbour."""
-    (view, other), (depth, other_depth) = pair, depths
-    motion = _motion(view, other)
+    motion = other.camera.T_cam_world @ np.linalg.inv(view.camera.T_cam_world)
     dtype = f"f{library.dtype.itemsize}"
     planes = np.empty((PLANES, *depth.shape), dtype)
     arrays = {
@@ -256,8 +240,7 @@ def brightness_share(
     depth: np.ndarray,
     other_depth: np.ndarray,
     settings: MatchSettings,
-    *,
-    library: Library | None = None,
+    library: Library,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which share of the difference between two images is brightness, and the weight of each pixel.
 
@@ -275,14 +258,11 @@ def brightness_share(
     share, weight : ndarray [H, W] float64
         Where the images cannot be compared, NaN and 0. The weight is that of texture in :func:`match_views`.
     """
-    if library is None:
-        warped, _, visible = _warped(view, other, depth, other_depth, settings.occluded)
-    else:
-        into = PixelPull.zeros(view.camera, f"f{library.dtype.itemsize}")
-        planes = _match_natively((view, other), (depth, other_depth), settings, into, library)
-        warped, visible = planes[WARPED], planes[VISIBLE] > 0
+    into = PixelPull.zeros(view.camera, f"f{library.dtype.itemsize}")
+    planes = match_views(view, other, depth, other_depth, settings, into, library)
+    visible = planes[VISIBLE] > 0
     seen = visible.astype(np.float64)
-    a, b = view.grey * seen, np.asarray(warped, np.float64)
+    a, b = view.grey * seen, np.asarray(planes[WARPED], np.float64)
     n, sum_a, sum_b, aa, bb = (_sums(k, settings.radius) for k in (seen, a, b, a * a, b * b))
     enough = visible & (n >= ENOUGH * (2 * settings.radius + 1) ** 2)
     n = np.maximum(n, 1.0)
@@ -305,7 +285,7 @@ def gather_vertices(
     pull: PixelPull,
     into: VertexPull,
     settings: MatchSettings,
-    library: Library | None = None,
+    library: Library,
 ) -> None:
     """Add the derivatives of the pixels of a view to the vertices of their faces.
 
@@ -321,14 +301,10 @@ def gather_vertices(
     pull : PixelPull
     into : VertexPull
     settings : MatchSettings
-    library : Library or None
-        None: in numpy.
+    library : Library
     """
     local = np.ascontiguousarray(surface.vertices @ camera.rotation.T + camera.T_cam_world[:3, 3])
     normals = np.ascontiguousarray(surface.normals @ camera.rotation.T)
-    if library is None:
-        _gather(Surface(local, surface.faces, normals), camera, face, pull, into, settings.grazing)
-        return
     arrays = {
         "local": local,
         "normals": normals,
@@ -349,102 +325,7 @@ def gather_vertices(
     gather_on_cpu(library, arguments)
 
 
-# -- in numpy ----------------------------------------------------------------------------------------------------------
-def _rays(camera: Camera) -> np.ndarray:
-    """Return the rays of pixel centres, [H, W, 3] with z = 1."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=2)
-
-
-def _motion(view: GreyImage, other: GreyImage) -> np.ndarray:
-    """Return the transform [4, 4] from the view's camera axes to the neighbour's."""
-    return np.asarray(other.camera.T_cam_world @ np.linalg.inv(view.camera.T_cam_world))
-
-
-def _warped(
-    view: GreyImage, other: GreyImage, depth: np.ndarray, other_depth: np.ndarray, occluded: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the neighbour as the view sees it [H, W], its derivative by depth [H, W], and what is visible [H, W]."""
-    motion = _motion(view, other)
-    turned = _rays(view.camera) @ motion[:3, :3].T
-    d = np.asarray(depth, np.float64)
-    point = d[..., None] * turned + motion[:3, 3]
-    seen = (d > 0) & (point[..., 2] > MIN_SCALE * d)
-    if view.usable is not None:
-        seen &= view.usable
-    z = np.where(seen, point[..., 2], 1.0)
-    u, v = point[..., 0] / z, point[..., 1] / z
-    camera = other.camera
-    x, y = camera.fx * u + camera.cx - 0.5, camera.fy * v + camera.cy - 0.5
-    seen &= (x >= 0) & (y >= 0) & (x < camera.width - 1) & (y < camera.height - 1)
-    x, y = np.where(seen, x, 0.0), np.where(seen, y, 0.0)
-    i, j = x.astype(np.int64), y.astype(np.int64)
-    if other.usable is not None:
-        seen &= other.usable[j + (y - j >= 0.5), i + (x - i >= 0.5)]
-    around = np.stack([other_depth[j + dj, i + di] for dj in (0, 1) for di in (0, 1)])
-    seen &= ((around > 0) & (np.abs(around - z) <= occluded * z)).any(axis=0)
-    p00, p01, p10, p11 = (other.grey[j + dj, i + di] for dj in (0, 1) for di in (0, 1))
-    fx, fy = x - i, y - j
-    by_x, by_y = (p01 - p00) * (1 - fy) + (p11 - p10) * fy, (p10 - p00) * (1 - fx) + (p11 - p01) * fx
-    value = p00 + fx * (p01 - p00) + fy * by_y
-    slope = by_x * camera.fx * (turned[..., 0] - u * turned[..., 2])
-    slope += by_y * camera.fy * (turned[..., 1] - v * turned[..., 2])
-    return np.where(seen, value, 0.0), np.where(seen, slope / z, 0.0), seen
-
-
 def _sums(values: np.ndarray, radius: int) -> np.ndarray:
     """Return the sums over windows, with zeros beyond the border."""
     side = 2 * radius + 1
     return np.asarray(uniform_filter(values, side, np.float64, mode="constant") * side**2)
-
-
-def _match(
-    view: GreyImage,
-    other: GreyImage,
-    depth: np.ndarray,
-    other_depth: np.ndarray,
-    settings: MatchSettings,
-    into: PixelPull,
-) -> None:
-    b, slope, seen = _warped(view, other, depth, other_depth, settings.occluded)
-    visible = seen.astype(np.float64)
-    a = np.asarray(view.grey, np.float64) * visible
-    n, sum_a, sum_b, aa, bb, ab = (_sums(k, settings.radius) for k in (visible, a, b, a * a, b * b, a * b))
-    enough = seen & (n >= ENOUGH * (2 * settings.radius + 1) ** 2)
-    n = np.maximum(n, 1.0)
-    mean_a, mean_b = sum_a / n, sum_b / n
-    var_a, var_b = np.maximum(aa / n - mean_a**2, 0.0), np.maximum(bb / n - mean_b**2, 0.0)
-    product = np.sqrt(var_a * var_b)
-    enough &= product > 0
-    ncc = np.where(enough, ab / n - mean_a * mean_b, 0.0) / np.where(enough, product, 1.0)
-    weaker = np.minimum(var_a, var_b)
-    weight = np.clip((ncc - settings.poor) / (settings.good - settings.poor), 0.0, 1.0)
-    weight = np.where(enough, weight * weaker / (weaker + settings.texture), 0.0)
-    by_grey = weight / (n * np.where(enough, product, 1.0))
-    by_warped = weight / (n * np.where(enough, var_b, 1.0))
-    factors = (-by_grey, ncc * by_warped, by_grey * mean_a - ncc * by_warped * mean_b, by_warped)
-    of_a, of_b, of_one, bend = (_sums(k, settings.radius) for k in factors)
-    into.gradient[...] += np.where(seen, (of_a * a + of_b * b + of_one) * slope, 0.0)
-    into.curvature[...] += np.where(seen, bend * slope**2, 0.0)
-    into.sums[...] += (weight * (1 - ncc)).sum(), weight.sum()
-
-
-def _gather(
-    surface: Surface, camera: Camera, face: np.ndarray, pull: PixelPull, into: VertexPull, grazing: float
-) -> None:
-    """Gather with a surface in camera axes."""
-    rows, columns = np.nonzero((face >= 0) & ((pull.gradient != 0) | (pull.curvature != 0)))
-    corners = surface.faces[face[rows, columns]]  # [n, 3]
-    ray = _rays(camera)[rows, columns]
-    p = surface.vertices[corners]  # [n, 3, 3]
-    normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    along = (normal * ray).sum(axis=1)
-    front = (along < 0) & (along**2 > grazing**2 * (normal**2).sum(axis=1) * (ray**2).sum(axis=1))
-    corners, along, ray, p = corners[front], along[front], ray[front], p[front]
-    share = np.stack([(np.cross(p[:, (k + 1) % 3], p[:, (k + 2) % 3]) * ray).sum(axis=1) for k in range(3)], axis=1)
-    share /= share.sum(axis=1, keepdims=True)
-    by = np.einsum("nkc,nc->nk", surface.normals[corners], normal[front]) / along[:, None]
-    gradient, curvature = (values[rows, columns][front, None] for values in (pull.gradient, pull.curvature))
-    np.add.at(into.gradient, corners, share * by * gradient)
-    np.add.at(into.curvature, corners, share * by**2 * curvature)

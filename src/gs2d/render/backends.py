@@ -21,7 +21,7 @@ from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels import torch_kernels
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.native_losses import LossOperations
-from gs2d.kernels.tsdf import FusionOnDevice, FusionOnHost
+from gs2d.kernels.tsdf import FusionOnDevice
 from gs2d.render.types import Features, RasterSettings, RenderOutput
 from gs2d.render.whole_step import WholeStep
 
@@ -202,8 +202,8 @@ class Backend:
         """Return fused operations for the losses of images on a device; None: torch computes them."""
         return None
 
-    def fusion(self) -> FusionOnHost | FusionOnDevice | None:
-        """Return what fuses depth maps into volumes; None: numpy does."""
+    def fusion(self) -> FusionOnDevice | None:
+        """Return what fuses depth maps into volumes; None: the native CPU library does."""
         return None
 
     # -- a training iteration ----------------------------------------------------------------------------------------

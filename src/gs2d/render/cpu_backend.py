@@ -14,7 +14,6 @@ from gs2d.errors import BackendError
 from gs2d.kernels import densify_stats, library, native_adam, native_losses
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.native_losses import LossOperations
-from gs2d.kernels.tsdf import FusionOnHost
 from gs2d.render import cpu_cached
 from gs2d.render.backends import Backend, BackendStatus, register_backend
 from gs2d.render.cpu_cached import CachedView
@@ -89,10 +88,6 @@ class CpuBackend(Backend):
             native_losses.masked_mean,
             native_losses.blur,
         )
-
-    def fusion(self) -> FusionOnHost:
-        """Return what fuses depth maps into volumes."""
-        return FusionOnHost(library.load())
 
     def adam_step(self, updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:
         """Run one Adam step on several attributes in one call."""

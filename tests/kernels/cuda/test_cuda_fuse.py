@@ -1,4 +1,4 @@
-"""GPU fusion, emulated on the CPU, against numpy."""
+"""GPU fusion, emulated on the CPU, against the native library."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import torch
 
 import emulate
 from depth_waves import waves
+from gs2d.kernels.tsdf import FusionOnDevice
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
 from gs2d.meshing.sampling import make_sampler
-from gs2d.meshing.tsdf_volume import Volume, add_in_numpy, add_on_gpu, block_grid, invalid_volume, touched_blocks
+from gs2d.meshing.tsdf_volume import Volume, add_natively, add_on_gpu, block_grid, invalid_volume, touched_blocks
 
 
 @pytest.mark.parametrize("colored", [True, False])
-def test_the_kernel_leaves_the_field_of_numpy_in_every_bit(emulator: emulate.Emulator, colored: bool) -> None:
+def test_the_kernel_leaves_the_field_of_the_cpu_in_every_bit(emulator: emulate.Emulator, colored: bool) -> None:
     views = waves(4, colored=colored)
     limits = derive_limits([sample_depths(view) for view in views], [view.camera for view in views], voxel=0.08)
     limits = replace(limits, truncation=0.3)
@@ -28,7 +29,8 @@ def test_the_kernel_leaves_the_field_of_numpy_in_every_bit(emulator: emulate.Emu
         return invalid_volume(limits, dims, keys, colored=colored, frames=4)
 
     found, expected = empty(), empty()
-    with add_on_gpu([found], emulator, torch.device("cpu")) as add, add_in_numpy([expected], 1) as add_too:
+    gpu = FusionOnDevice(emulator, torch.device("cpu"))
+    with add_on_gpu([found], gpu) as add, add_natively([expected], 1) as add_too:
         for view in views:
             add(make_sampler(view, limits))
             add_too(make_sampler(view, limits))

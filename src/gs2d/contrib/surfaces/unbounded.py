@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -54,7 +53,6 @@ from gs2d.meshing.tsdf_volume import (
     Volume,
     VolumeBlocks,
     add_all,
-    block_finder,
     check_truncation,
     fusion_backend,
     invalid_volume,
@@ -63,10 +61,6 @@ from gs2d.meshing.tsdf_volume import (
     touched_blocks,
 )
 from gs2d.render.backends import Backend
-
-if TYPE_CHECKING:
-    from gs2d.kernels.library import Library
-
 
 # -- the volumes -------------------------------------------------------------------------------------------------------
 # All cubes have the same centre and the same number of voxels along a side. A level owns its cube except for the inner
@@ -221,7 +215,6 @@ def find_cascade_blocks(
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    backend: str | Backend = "auto",
 ) -> tuple[VolumeBlocks, ...]:
     """Find the blocks of each level; parameters and errors as for ``fuse``, with a common limit of memory."""
     if iter(frames) is frames:
@@ -229,11 +222,11 @@ def find_cascade_blocks(
     check_truncation(cascade.levels[0])
     budget = Budget(cascade.levels[0], max_bytes, side=2 * cascade.half, step=STEP)
     keys = [np.zeros(0, dtype=np.int64) for _ in cascade.levels]
-    colored, count, library = False, 0, block_finder(backend, threads)
+    colored, count = False, 0
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
         budget.check_least(min_blocks(item, cascade.levels[0]), colored)
-        for k, found in enumerate(_touched(item, cascade, library)):
+        for k, found in enumerate(_touched(item, cascade, threads)):
             keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
@@ -276,7 +269,7 @@ def _truncations(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
     return cascade.levels[0].truncation * np.exp2(np.minimum(level, len(cascade.levels) - 1))
 
 
-def _touched(item: DepthMap, cascade: TsdfCascade, library: Library | None) -> list[np.ndarray]:
+def _touched(item: DepthMap, cascade: TsdfCascade, threads: int | None) -> list[np.ndarray]:
     """Return the keys of each level's own blocks near the surface of a depth map."""
     distance = _distances(item, cascade)
     first, last = cascade.hole
@@ -291,7 +284,7 @@ def _touched(item: DepthMap, cascade: TsdfCascade, library: Library | None) -> l
         step = BLOCK * limits.voxel
         lower = (limits.lower[0] - step, limits.lower[1] - step, limits.lower[2] - step)
         dims = (cascade.dims[0] + 2,) * 3
-        keys = touched_blocks(part, replace(limits, lower=lower), dims, library)
+        keys = touched_blocks(part, replace(limits, lower=lower), dims, threads)
         blocks = np.stack(np.unravel_index(keys, dims), axis=1) - 1
         blocks = blocks[((blocks >= 0) & (blocks < cascade.dims[0])).all(axis=1)]
         if k:
@@ -602,7 +595,7 @@ def extract_unbounded(
             cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
         del samples
         trim()
-        blocks = find_cascade_blocks(spool, cascade, max_bytes=options.max_bytes, threads=threads, backend=backend)
+        blocks = find_cascade_blocks(spool, cascade, max_bytes=options.max_bytes, threads=threads)
         count, volume_bytes = len(spool), sum(level.nbytes for level in blocks)
         mesh = fused_cascade_surface(
             spool,

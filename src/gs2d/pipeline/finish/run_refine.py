@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gs2d.core.mesh import Mesh
-from gs2d.kernels.library import optional_library
+from gs2d.kernels.library import ready_library
 from gs2d.meshing.refine import Refinement, RefineSettings
 from gs2d.meshing.texture import ColorSource
 from gs2d.meshing.warped_ncc import GreyImage
@@ -37,6 +37,6 @@ def refined(
         grey = small.image[..., :3] @ np.asarray(GREY, np.float32) / np.float32(255)
         return GreyImage(small.camera, np.ascontiguousarray(grey, np.float32), small.valid)
 
-    refinement = Refinement(mesh, [view.camera for view in views], read, settings, optional_library())
+    refinement = Refinement(mesh, [view.camera for view in views], read, settings, ready_library())
     on_event(Phase("refining the mesh", refinement.work))
     return refinement.run(lambda done: on_event(Step(done)))
