@@ -59,7 +59,7 @@ INSIDE = {
         "prior_maps faces masks": 4,
         "cache exif file_names undistort": 3,
         "camera_models image_files photo_formats positions": 2,
-        "arrays csv_tables float_images": 1,
+        "arrays csv_tables": 1,
     },
     "losses": {
         "prior_terms": 3,

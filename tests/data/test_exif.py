@@ -1,7 +1,8 @@
-"""EXIF and XMP metadata, including damaged blocks."""
+"""EXIF metadata, including damaged blocks."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,30 +10,15 @@ from PIL import ExifTags, Image
 
 from gs2d.data.exif import Taken, read_place, read_taken
 
-DJI = (
-    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:AbsoluteAltitude="+198.31" '
-    'drone-dji:RelativeAltitude="+39.80" drone-dji:{latitude}="+46.84260708" drone-dji:{longitude}="-91.99455989"/>'
-    "</x:xmpmeta>"
-)
-SENSEFLY = (
-    "<x:xmpmeta><rdf:Description><sensefly:AltitudeAMSL>313.9</sensefly:AltitudeAMSL>"
-    "<sensefly:AltitudeWGS84>281.6</sensefly:AltitudeWGS84><sensefly:Latitude>41.034671</sensefly:Latitude>"
-    "<sensefly:Longitude>-83.305725</sensefly:Longitude></rdf:Description></x:xmpmeta>"
-)
-STANDARD = (
-    '<x:xmpmeta><rdf:Description exif:GPSLatitude="46,50.5564S" exif:GPSLongitude="91,59,40E" '
-    'exif:GPSAltitude="3/2" exif:GPSAltitudeRef="1"/></x:xmpmeta>'
-)
 
-
-def write(path: Path, *, xmp: str = "", gps: dict[int, object] | None = None, time: str = "", part: str = "") -> Path:
+def write(path: Path, *, gps: dict[int, object] | None = None, time: str = "", part: str = "") -> Path:
     exif = Image.Exif()
     if gps is not None:
         exif[ExifTags.IFD.GPSInfo] = gps
     if time:
         exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DateTimeOriginal] = time
         exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.SubsecTimeOriginal] = part
-    Image.new("RGB", (8, 8)).save(path, exif=exif, **({"xmp": xmp.encode()} if xmp else {}))
+    Image.new("RGB", (8, 8)).save(path, exif=exif)
     return path
 
 
@@ -47,38 +33,16 @@ def gps(latitude: float, longitude: float, *, height: float | None = None) -> di
     return entries
 
 
-@pytest.mark.parametrize(
-    ("xmp", "expected"),
-    [
-        (DJI.format(latitude="GpsLatitude", longitude="GpsLongitude"), (46.84260708, -91.99455989, 198.31)),
-        (DJI.format(latitude="GpsLatitude", longitude="GpsLongtitude"), (46.84260708, -91.99455989, 198.31)),
-        (DJI.format(latitude="Latitude", longitude="Longitude"), (46.84260708, -91.99455989, 198.31)),
-        (SENSEFLY, (41.034671, -83.305725, 281.6)),
-        (STANDARD, (-(46 + 50.5564 / 60), 91 + 59 / 60 + 40 / 3600, -1.5)),
-    ],
-    ids=["dji", "dji's own spelling", "dji, older", "sensefly", "standard"],
-)
-def test_the_position_is_read_from_xmp_if_exif_has_none(
-    tmp_path: Path, xmp: str, expected: tuple[float, float, float]
-) -> None:
-    place = read_taken(write(tmp_path / "a.jpg", xmp=xmp)).place
-    assert place == pytest.approx(expected)
+def test_the_position_has_signs_and_an_optional_height(tmp_path: Path) -> None:
+    assert read_taken(write(tmp_path / "a.jpg", gps=gps(-46.5, 91.25, height=-1.5))).place == (-46.5, 91.25, -1.5)
+    latitude, longitude, height = read_taken(write(tmp_path / "b.jpg", gps=gps(46.5, -91.25))).place or (0, 0, 0)
+    assert (latitude, longitude) == (46.5, -91.25)
+    assert math.isnan(height)
 
 
-@pytest.mark.parametrize(
-    "xmp",
-    [
-        "",
-        "not XML at all <<<",
-        DJI.format(latitude="GpsLatitude", longitude="Nothing"),
-        SENSEFLY.replace("41.034671", "north"),
-        SENSEFLY.replace("41.034671", "141.0"),
-        SENSEFLY.replace("41.034671", "0").replace("-83.305725", "0.0"),
-    ],
-    ids=["none", "no XML", "one alone", "a word", "no latitude", "no fix"],
-)
-def test_an_invalid_position_is_ignored(tmp_path: Path, xmp: str) -> None:
-    assert read_taken(write(tmp_path / "a.jpg", xmp=xmp)).place is None
+@pytest.mark.parametrize("place", [None, gps(141.0, 8.0), gps(0.0, 0.0)], ids=["none", "no latitude", "no fix"])
+def test_an_invalid_position_is_ignored(tmp_path: Path, place: dict[int, object] | None) -> None:
+    assert read_taken(write(tmp_path / "a.jpg", gps=place)).place is None
     assert read_place(tmp_path / "a.jpg") is None
 
 

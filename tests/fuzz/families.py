@@ -348,17 +348,6 @@ def _counted(root: Path) -> None:
     np.save(root / "mesh_seen.npy", np.arange(len(_FACES)))
 
 
-def _exr(name: str, channels: str, compression: str, dtype: type = np.float32) -> Callable[[Path], object]:
-    def write(root: Path) -> None:
-        import OpenEXR
-
-        pixels = np.random.default_rng(0).uniform(0, 2, (12, 16)).astype(dtype)
-        header = {"compression": getattr(OpenEXR, compression), "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, {channel: pixels for channel in channels}).write(str(root / name))
-
-    return write
-
-
 # -- places in the world -----------------------------------------------------------------------------------------------
 _TABLES = {
     "control.csv": "# EPSG:32632\nname,x,y,z,photo,u,v,check\nA,600000.5,5200000,400,f_0.png,12.5,7,\n"
@@ -489,11 +478,6 @@ _ALL = (
         _image("a.tif", compression="tiff_lzw"), _image("a.bmp"), _image("a.ppm"),
         _image("a.jp2")),
         {".png": m.of_png, "": m.of_bytes}, read_picture),
-    Family("exr", written(
-        _exr("a.exr", "RGB", "ZIP_COMPRESSION"), _exr("a.exr", "RGBA", "PIZ_COMPRESSION", np.float16),
-        _exr("a.exr", "Z", "RLE_COMPRESSION"), _exr("a.exr", "RGB", "NO_COMPRESSION"),
-        _exr("a.exr", "RGB", "DWAA_COMPRESSION", np.float16), _exr("a.exr", "Y", "B44_COMPRESSION", np.float16)),
-        {".exr": m.of_bytes}, read_picture),
     Family("places", written(lambda root: [(root / name).write_text(text) for name, text in _TABLES.items()]),
            {".csv": _TEXT, ".txt": _TEXT}, read_places),
     Family("official", written(_official), {".json": _JSON, ".txt": _TEXT, ".log": _TEXT}, read_official),

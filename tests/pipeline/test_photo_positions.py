@@ -38,7 +38,7 @@ def test_photographs_without_a_position_are_reported() -> None:
     positions, note = metric_positions(line(30, 20.0, without=5), None)
     assert positions[:5] == [None] * 5
     assert None not in positions[5:]
-    assert note == "5 of 30 photographs have no position (000.jpg, 001.jpg, 002.jpg ...; GPS in EXIF or XMP)"
+    assert note == "5 of 30 photographs have no position (000.jpg, 001.jpg, 002.jpg ...; GPS in EXIF)"
 
 
 def test_positions_within_the_error_of_gps_are_not_used() -> None:

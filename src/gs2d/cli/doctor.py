@@ -12,7 +12,6 @@ from gs2d.core.extras import FFMPEG, install
 
 _EXTRAS = {  # extra -> (the commands that need it, its packages)
     "sfm": ("cameras of photographs (gs2d reconstruct, poses)", ("pycolmap",)),
-    "exr": ("OpenEXR photographs and depth maps", ("OpenEXR",)),
     "geo": ("maps (gs2d survey --gps, --orthophoto)", ("pyproj", "tifffile")),
     "markers": ("printed markers (gs2d survey --markers)", ("opencv-python-headless",)),
     "collision": ("convex pieces (gs2d mesh --collision)", ("coacd",)),

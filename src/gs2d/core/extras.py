@@ -16,7 +16,6 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "collision": ("coacd>=1.0.5",),
         "cuda12": ("cuda-bindings>=12.8,<13", "nvidia-cuda-nvrtc-cu12>=12.4"),
         "cuda13": ("cuda-bindings>=13,<14", "nvidia-cuda-nvrtc>=13,<14"),
-        "exr": ("OpenEXR>=3.5",),
         "geo": ("pyproj>=3.6", "tifffile>=2024.1"),
         "markers": ("opencv-python-headless>=4.7",),
         "sfm": ("pycolmap>=4.2",),

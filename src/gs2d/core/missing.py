@@ -13,7 +13,7 @@ from pathlib import Path
 
 _ALIKE = 0.6  # smallest ratio of difflib for a suggested name
 _UP = 3  # number of parent folders that are searched
-_PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif", ".exr")
+_PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif")
 _CAPTURES = (  # files and folders of captures
     *("transforms.json", "transforms_train.json", "cameras.npz", "cameras_sphere.npz", "sparse"),
     *("reconstruction.json", "opensfm", "cameras.xml", "*.sfm"),

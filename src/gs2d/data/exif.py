@@ -1,4 +1,4 @@
-"""EXIF and XMP metadata of an image: position, time, orientation and camera.
+"""EXIF metadata of an image: position, time, orientation and camera; XMP tells panoramas.
 
 Damaged metadata is ignored.
 """
@@ -26,10 +26,6 @@ DAMAGED_EXIF = (
 )
 _UPRIGHT = 1
 _ORIENTATIONS = range(1, 9)
-# Names in XMP, without prefix: DJI (including its misspelling), senseFly and others; the first one is used.
-_LATITUDES = ("GpsLatitude", "GPSLatitude", "Latitude")
-_LONGITUDES = ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
-_HEIGHTS = ("AbsoluteAltitude", "AltitudeWGS84", "GPSAltitude", "AltitudeAMSL")
 
 
 @dataclass(frozen=True)
@@ -68,7 +64,7 @@ def read_taken(path: Path) -> Taken:
             tags = [exif.get(base.Make), exif.get(base.Model)]
             tags += [details.get(tag) for tag in (base.LensModel, base.FocalLength, base.FocalLengthIn35mmFilm)]
             made_by = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
-            place, seconds, panorama = _place(exif, xmp), _seconds(exif, details), _panorama(xmp)
+            place, seconds, panorama = _place(exif), _seconds(exif, details), _panorama(xmp)
     except DAMAGED_EXIF:
         return Taken()
     return Taken(orientation if orientation in _ORIENTATIONS else _UPRIGHT, made_by, place, seconds, panorama)
@@ -98,16 +94,7 @@ def _panorama(xmp: str) -> str:
 
 
 # -- position ----------------------------------------------------------------------------------------------------------
-def _place(exif: Image.Exif, xmp: str) -> tuple[float, float, float] | None:
-    """Return the position of EXIF, else that of XMP; a missing height is taken from XMP."""
-    place = _exif_place(exif)
-    other = _xmp_place(xmp) if place is None or math.isnan(place[2]) else None
-    if place is None or other is None:
-        return place or other
-    return place[0], place[1], other[2]
-
-
-def _exif_place(exif: Image.Exif) -> tuple[float, float, float] | None:
+def _place(exif: Image.Exif) -> tuple[float, float, float] | None:
     gps = ExifTags.GPS
     try:
         tags: Mapping[int, Any] = exif.get_ifd(ExifTags.IFD.GPSInfo)
@@ -128,40 +115,10 @@ def _degrees(parts: Sequence[Any], side: Any, negative: str) -> float:
     return -value if letter.strip("\0 ").upper() == negative else value
 
 
-def _xmp_place(xmp: str) -> tuple[float, float, float] | None:
-    try:
-        latitude, longitude = (_xmp_degrees(_named(xmp, names)) for names in (_LATITUDES, _LONGITUDES))
-    except DAMAGED_EXIF:
-        return None
-    try:
-        top, _, bottom = _named(xmp, _HEIGHTS).partition("/")
-        height = float(top) / float(bottom or 1)
-    except DAMAGED_EXIF:
-        height = math.nan
-    if _found(xmp, "GPSAltitudeRef") == "1" and not _found(xmp, "AbsoluteAltitude"):
-        height = -height
-    return _believable(latitude, longitude, height)
-
-
-def _named(xmp: str, names: Sequence[str]) -> str:
-    """Return the value of the first of these names in XMP; "" without any."""
-    return next(filter(None, (_found(xmp, name) for name in names)), "")
-
-
 def _found(xmp: str, name: str) -> str:
     """Return the value of a name with any prefix in XMP, as attribute or element; "" without it."""
     found = re.search(rf"[\w-]+:{name}\s*(?:=\s*[\"']([^\"'<>]*)[\"']|>([^<]*)<)", xmp)
     return (found[1] or found[2] or "").strip() if found else ""
-
-
-def _xmp_degrees(text: str) -> float:
-    """Parse degrees: ``+46.84``, or EXIF's form in XMP, ``46,50.55N`` or ``46,50,33N``."""
-    letter = text[-1:].upper()
-    if letter not in ("N", "S", "E", "W"):
-        return float(text)
-    parts = [float(part) for part in text[:-1].split(",")]
-    value = sum(part / 60**k for k, part in enumerate(parts[:3]))
-    return -value if letter in ("S", "W") else value
 
 
 def _believable(latitude: float, longitude: float, height: float) -> tuple[float, float, float] | None:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".exr")
+IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif")
 #: Folders of a capture whose images have the names of photographs but are something else.
 NO_PHOTOGRAPHS = frozenset({"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"})
 _SMALLER = re.compile(r"images_\d+")  # downscaled copies

@@ -18,7 +18,6 @@ from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.image_arrays import to_uint8
 from gs2d.core.text import first_line
-from gs2d.data.float_images import exr_size, is_exr, read_exr, read_exr_map
 from gs2d.errors import DataError, ShapeError
 
 #: Formats that Pillow may open. Others are rarely tested or start external programs (EPS: Ghostscript).
@@ -80,8 +79,6 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     DataError
         If the file is missing or not an image.
     """
-    if is_exr(path):
-        return exr_size(path)
     with _opened(path, "{path} must be an image, got: {error}") as file:
         return file.size
 
@@ -93,7 +90,7 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode an image.
 
     EXIF orientation is **not** applied, as in COLMAP: poses refer to the stored pixels. Grey and palette images become
-    RGB, 16-bit grey becomes 8-bit, linear floats (OpenEXR) become sRGB.
+    RGB, 16-bit grey becomes 8-bit.
 
     Returns
     -------
@@ -104,12 +101,10 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     DataError
         If the file is missing, truncated, not an image of ``FORMATS``, or has implausibly many pixels.
     """
-    if is_exr(path):
-        return read_exr(path)
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
         if file.mode == "F":
-            raise DataError(f"image {os.fspath(path)} must hold integers, got floats; save it as 16-bit or OpenEXR")
+            raise DataError(f"image {os.fspath(path)} must hold integers, got floats; save it with 16 bits")
         if file.mode.startswith("I;16") or file.mode == "I":
             grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
             return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)
@@ -126,8 +121,6 @@ def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
     DataError
         As for :func:`read_image`.
     """
-    if is_exr(path):
-        return read_exr_map(path), "F"
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
         return np.asarray(file), file.mode

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
 
 from PIL import features
-
-from gs2d.core.extras import install
-from gs2d.data.float_images import EXR_SUFFIX
 
 
 def _reads_heif() -> bool:
@@ -23,11 +19,10 @@ def _reads_heif() -> bool:
 
 AVIF = (".avif",) if "avif" in features.modules and features.check("avif") else ()  # Pillow 11.3 and newer
 HEIF = (".heic", ".heif") if _reads_heif() else ()
-EXR = (EXR_SUFFIX,) if importlib.util.find_spec("OpenEXR") is not None else ()
 _ALL_HEIF = (".heic", ".heif")
-_RAWS = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+_UNSUPPORTED = (".exr", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 #: suffixes of images that cannot be read
-UNREAD = tuple(suffix for suffix in (*_ALL_HEIF, ".avif", EXR_SUFFIX, *_RAWS) if suffix not in (*AVIF, *HEIF, *EXR))
+UNREAD = tuple(suffix for suffix in (*_ALL_HEIF, ".avif", *_UNSUPPORTED) if suffix not in (*AVIF, *HEIF))
 
 
 def remedy(suffix: str) -> str:
@@ -35,8 +30,8 @@ def remedy(suffix: str) -> str:
     convert = f"convert them to JPEG (magick mogrify -format jpg *{suffix})"
     if suffix in _ALL_HEIF:
         return f"pip install pi-heif (its wheel holds LGPL code), or {convert}"
-    if suffix == EXR_SUFFIX:
-        return f"{install('exr')} to have OpenEXR read"
     if suffix == ".avif":
         return f"install Pillow 11.3 or newer, or {convert}"
+    if suffix == ".exr":
+        return convert
     return "raw files are not supported; export JPEG or PNG from your photo program"

@@ -22,7 +22,7 @@ from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 DEPTHS, NORMALS = "depths", "normals"
-DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
+DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
 NORMAL_SUFFIXES = (".npy", ".png", ".jpg", ".jpeg", ".webp")
 AGREE = 0.05  # largest relative difference of neighbours; more is an edge
 UNIT_LENGTH = (0.8, 1.2)  # accepted lengths of normals

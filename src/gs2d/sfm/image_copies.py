@@ -13,7 +13,6 @@ from PIL import ExifTags, Image
 
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.data.exif import DAMAGED_EXIF
-from gs2d.data.float_images import is_exr
 from gs2d.data.image_files import open_image, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.photos import JPEG, Photo, turn
@@ -87,12 +86,7 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> None:
 
 
 def _kept(source: Path) -> dict[str, bytes]:
-    """Return the colour profile (of RGB images only) and EXIF block of an image, for Pillow's ``save``.
-
-    Nothing is kept of float images: they have been converted to sRGB, and Pillow cannot open all of them.
-    """
-    if is_exr(source):
-        return {}
+    """Return the colour profile (of RGB images only) and EXIF block of an image, for Pillow's ``save``."""
     with open_image(source) as file:
         profile = file.info.get("icc_profile") if file.mode in ("RGB", "RGBA") else None
         kept = {"icc_profile": profile} if profile else {}

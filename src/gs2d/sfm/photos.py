@@ -15,13 +15,13 @@ from gs2d.core.missing import belongs_to_run, path_hint, suggestion
 from gs2d.data.exif import Taken, read_taken
 from gs2d.data.image_files import read_image
 from gs2d.data.masks import FOLDER, without_masks
-from gs2d.data.photo_formats import AVIF, EXR, HEIF, UNREAD, remedy
+from gs2d.data.photo_formats import AVIF, HEIF, UNREAD, remedy
 from gs2d.errors import DataError
 from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.video_frames import VIDEOS
 
 JPEG, PNG = (".jpg", ".jpeg"), (".png",)
-CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF, *HEIF, *EXR)
+CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF, *HEIF)
 _KINDS = {
     suffix: kind
     for kind, suffixes in (("unread", UNREAD), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))

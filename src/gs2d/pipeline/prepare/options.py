@@ -171,7 +171,7 @@ class PoseEstimation:
     """Similar photographs that each one is matched with, unless all pairs are matched."""
     positions: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Positions of photographs, for choosing pairs: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's geo.txt
-    (default: GPS in EXIF or XMP)."""
+    (default: GPS in EXIF)."""
     mapper: Annotated[Literal["auto", "incremental", "global"], SETTING] = "auto"
     """Estimate cameras one by one (incremental) or all at once (global). auto: global from 500 photographs."""
     max_size: Annotated[int | None, SETTING] = None

@@ -17,7 +17,7 @@ _SHOWN = 3
 
 
 def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list[Position | None], str]:
-    """Return the position of each photograph in a local frame, from a list or from EXIF and XMP, and a note.
+    """Return the position of each photograph in a local frame, from a list or from EXIF, and a note.
 
     Unknown positions are None. Heights are 0 unless all are known.
 
@@ -29,7 +29,7 @@ def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list
     labels = [photo.label for photo in photos]
     if listed is None:
         known = {photo.label: np.array(photo.taken.place) for photo in photos if photo.taken.place is not None}
-        positions = Positions(known, None, "GPS in EXIF or XMP", in_degrees=True)
+        positions = Positions(known, None, "GPS in EXIF", in_degrees=True)
     else:
         positions = read_positions(listed)
         known = matched(positions, labels)
