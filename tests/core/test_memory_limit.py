@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from gs2d.core.memory_limit import check_address_space, memory_limit
-from gs2d.errors import BackendError
+from gs2d.core.memory_limit import memory_limit
 
 MB = 1 << 20
 
@@ -60,30 +58,6 @@ def test_the_smallest_limit_is_used(
     assert limit.used == pytest.approx(100 * MB, abs=1 << 16)
     assert limit.room == pytest.approx((expected - 100) * MB, abs=1 << 16)
     assert word in limit.source
-
-
-def test_too_little_address_space_for_the_libraries_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "5")
-    for allowed, fits in ((1300 * MB, False), (1400 * MB, True), (resource.RLIM_INFINITY, True)):
-        monkeypatch.setattr(resource, "getrlimit", lambda _which, allowed=allowed: (allowed, allowed))
-        if fits:
-            check_address_space()
-        else:
-            with pytest.raises(BackendError, match="ulimit"):
-                check_address_space()
-
-
-@pytest.mark.parametrize("allowed", [100, 400, 700, 1000])
-def test_a_command_with_too_little_address_space_ends_with_one_line(tmp_path: Path, allowed: int) -> None:
-    """At 700 MB the libraries alone would ask for memory for ever, at 400 MB C++ would end the process."""
-    code = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({allowed} << 20, {allowed} << 20))\n"
-    code += "from gs2d.cli import main; main()"
-    words = [sys.executable, "-c", code, "train", str(tmp_path), "--out", str(tmp_path / "run")]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 2, done
-    assert done.stderr.count("\n") == 1
-    assert "address" in done.stderr
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_real_limit_is_detected() -> None:

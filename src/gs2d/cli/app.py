@@ -32,7 +32,7 @@ from gs2d.cli.commands import (
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
-from gs2d.core.memory_limit import address_space, check_address_space
+from gs2d.core.memory_limit import address_space
 from gs2d.core.processes import process_rank
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
@@ -69,8 +69,6 @@ def run(argv: Sequence[str]) -> int:
         quiet=command.quiet, as_json=command.json, verbose=command.verbose, before_each=interruptible.check
     )
     try:
-        if not isinstance(command, RecipesCommand):
-            check_address_space()
         if not isinstance(command, _WITHOUT_TRAINING):
             importlib.import_module("gs2d.pipeline.train.train_run")  # with torch: see `interrupts`
         with interruptible:

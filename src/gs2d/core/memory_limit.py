@@ -11,13 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from gs2d.errors import BackendError
-
 __all__ = [
     "MemoryLimit",
     "address_space",
     "cache_bytes",
-    "check_address_space",
     "memory_budget",
     "memory_limit",
     "set_memory_budget",
@@ -25,8 +22,6 @@ __all__ = [
 
 CACHE_FRACTION = 0.2  # of the free memory, for a cache
 BUDGET_FRACTION = 0.5  # of the limit, default budget of a command
-LEAST_ADDRESSES = 1 << 30  # bytes of address space for loading Python, NumPy, SciPy and torch
-THREAD_ADDRESSES = 80 << 20  # bytes for each further thread of OpenBLAS, in NumPy and SciPy
 _UNLIMITED = 1 << 60  # cgroup v1 reports about 2^63 for no limit
 
 
@@ -90,28 +85,6 @@ def cache_bytes(wanted: int) -> int:
     """Return the size of a cache in bytes: ``wanted``, or less if memory is limited."""
     limit = memory_limit()
     return wanted if limit is None else min(wanted, int(CACHE_FRACTION * limit.room))
-
-
-def check_address_space() -> None:
-    """Raise BackendError if the address space is too small for loading the libraries.
-
-    To be called before: OpenBLAS would loop forever, and C++ would end the process.
-    """
-    limit = address_space()
-    needed = LEAST_ADDRESSES + THREAD_ADDRESSES * (_blas_threads() - 1)
-    if limit is not None and limit < needed:
-        raise BackendError(
-            f"the address space must be at least {needed / 2**30:.2f} GiB, got a limit of {limit / 2**30:.2f} GiB; "
-            "raise it (ulimit -v unlimited), and limit memory by a control group instead"
-        )
-
-
-def _blas_threads() -> int:
-    """Return the number of threads that OpenBLAS starts."""
-    for name in ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS"):
-        if (value := os.environ.get(name, "")).isdecimal() and int(value[:6]):
-            return int(value[:6])
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _own_pages(root: Path) -> tuple[int, int]:

@@ -6,9 +6,7 @@ import difflib
 import fnmatch
 import json
 import os
-import re
 import shlex
-import zipfile
 from pathlib import Path
 
 _ALIKE = 0.6  # smallest ratio of difflib for a suggested name
@@ -55,6 +53,11 @@ def suggestion(path: Path, needed: str) -> str:
     needed : str
         "run", "capture" or "photographs".
     """
+    if path.suffix.lower() == ".zip" and path.is_file():
+        folder = path.with_suffix("")
+        while folder.exists():
+            folder = folder.with_name(folder.name + "_unpacked")
+        return f"; unpack it with `python -m zipfile -e {_quoted(path)} {_quoted(folder)}`, and give that folder"
     if _SOG in _names_in(path):
         return f"; it holds splats: `gs2d view {_quoted(path / 'meta.json')}` shows them"
     here = [path, *list(path.parents)[:_UP]]
@@ -74,13 +77,9 @@ def suggestion(path: Path, needed: str) -> str:
     if capture is None and run is not None:
         capture = _capture_of(run)
     if needed == "capture":
-        if capture is not None and capture.is_dir():
-            return f"; give the capture {capture}"
         if capture is not None:
-            return f"; unpack it with `{_unpacking(capture)[0]}`, and give the folder with the capture"
+            return f"; give the capture {capture}"
         return _with_cameras(photos) if holds_photographs(photos) else "; give photographs with their cameras"
-    if capture is not None and capture.is_file():
-        return _with_training(capture)
     if capture is not None and holds_photographs(capture / "images"):
         return f"; give the folder of its photographs, {capture / 'images'}"
     if not holds_photographs(photos):
@@ -104,7 +103,7 @@ def _run_in(folder: Path) -> Path | None:
 
 
 def holds_photographs(path: Path) -> bool:
-    """Whether a folder or a ZIP file contains images but no cameras, by file names."""
+    """Whether a folder contains images but no cameras, by file names."""
     names = _names_in(path)
     return any(name.lower().endswith(_PHOTOS) for name in names) and _SOG not in names and not _holds_capture(path)
 
@@ -114,13 +113,10 @@ def _holds_capture(path: Path) -> bool:
 
 
 def _names_in(path: Path) -> set[str]:
-    """Return the names in a folder, or all path parts in a ZIP file; empty if it cannot be read."""
+    """Return the names in a folder; empty if it cannot be read."""
     try:
-        if path.suffix.lower() == ".zip" and path.is_file():
-            with zipfile.ZipFile(path) as file:
-                return {part for name in file.namelist() for part in re.split(r"[/\\]", name)}
         return set(os.listdir(path))
-    except (OSError, ValueError, zipfile.BadZipFile):
+    except (OSError, ValueError):
         return set()
 
 
@@ -134,31 +130,13 @@ def _capture_of(run: Path) -> Path | None:
 
 
 def _with_training(capture: Path) -> str:
-    """Return how to make a run from a capture, which may be in a ZIP file."""
-    first, folder = _after_unpacking(capture)
-    return f"; {first}`gs2d train {_quoted(folder)} --out RUN` makes a run of it"
+    """Return how to make a run from a capture."""
+    return f"; `gs2d train {_quoted(capture)} --out RUN` makes a run of it"
 
 
 def _with_cameras(photos: Path) -> str:
-    """Return how to make a run from images, which may be in a ZIP file."""
-    first, folder = _after_unpacking(photos)
-    return f"; {first}`gs2d reconstruct {_quoted(folder)} --out RUN` makes a run of its photographs"
-
-
-def _after_unpacking(path: Path) -> tuple[str, Path]:
-    """Return the beginning of a suggestion and the folder that it continues with; "" and the path for a folder."""
-    if not path.is_file():
-        return "", path
-    command, folder = _unpacking(path)
-    return f"unpack it with `{command}`, then ", folder
-
-
-def _unpacking(archive: Path) -> tuple[str, Path]:
-    """Return a command that unpacks a ZIP file, and the folder that it creates."""
-    folder = archive.with_suffix("")
-    while folder.exists():
-        folder = folder.with_name(folder.name + "_unpacked")
-    return f"python -m zipfile -e {_quoted(archive)} {_quoted(folder)}", folder
+    """Return how to make a run from images."""
+    return f"; `gs2d reconstruct {_quoted(photos)} --out RUN` makes a run of its photographs"
 
 
 def _quoted(path: Path) -> str:
