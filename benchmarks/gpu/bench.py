@@ -240,7 +240,7 @@ def facts(bench: Bench) -> dict[str, Any]:
         "multiprocessors": properties.multi_processor_count,
         "memory_bytes": properties.total_memory,
         "l2_bytes": getattr(properties, "L2_cache_size", None),
-        "details": diagnose.describe(diagnose.gather()),
+        "details": diagnose.machine(),
         "torch_cuda": torch.version.cuda,
     }
     found["clocks"] = clocks()

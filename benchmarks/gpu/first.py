@@ -22,6 +22,7 @@ from benchmarks.gpu import correctness, host
 from benchmarks.gpu.bench import ROOT, Bench, rounded, run_program
 from benchmarks.gpu.kernels import bench_trainer
 from benchmarks.gpu.scenes import FIRST, TOY, gpu_scene, scene_name
+from gs2d.errors import BackendError
 from gs2d.kernels.cuda import diagnose
 
 ITERATIONS, WARMUP, TRACED = 200, 16, 5
@@ -42,10 +43,11 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
 
 def machine() -> dict[str, Any]:
     """Report the backend's requirements on this machine, without importing the command line or its packages."""
-    facts = diagnose.gather()
-    lacking = diagnose.missing(facts)
-    found = {name: value if isinstance(value, bool | int) else str(value) for name, value in vars(facts).items()}
-    found["missing"] = None if lacking is None else f"{lacking.reason}; {lacking.remedy}"
+    found: dict[str, Any] = {"missing": None}
+    try:
+        found["details"] = diagnose.machine()
+    except BackendError as error:
+        found["missing"] = str(error)
     try:
         done = subprocess.run(["nvidia-smi"], capture_output=True, text=True, timeout=20, check=False)
         found["nvidia_smi"] = done.stdout.splitlines()

@@ -79,7 +79,7 @@ def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
         x, m = x.requires_grad_(), m > 0.4
         depth = torch.rand(*size, generator=g).add(1).requires_grad_()
         alpha = torch.rand(*size, generator=g).requires_grad_()
-        known = ops.photometric(x, y, m, ops.blur(y, launcher=emulator), launcher=emulator)
+        known = ops.photometric(x, y, m, launcher=emulator)
         values = ops.photometric(x, y, launcher=emulator)
         camera = case.camera.resized(size[1], size[0])
         normals = sum(

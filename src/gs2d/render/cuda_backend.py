@@ -11,13 +11,12 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.errors import BackendError
 from gs2d.kernels import torch_kernels
 from gs2d.kernels.cuda import cuda_adam, cuda_losses, diagnose, launch
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.native_losses import LossOperations
 from gs2d.kernels.tsdf import FusionOnDevice
-from gs2d.render.backends import Backend, BackendStatus, register_backend
+from gs2d.render.backends import Backend, register_backend
 from gs2d.render.cuda_rasterizer import CudaChoices, rasterize_with, splat_errors_with
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget
@@ -54,8 +53,9 @@ class CudaBackend(Backend):
     @classmethod
     def ready(cls) -> Self:
         """Return the backend, or raise BackendError with the first thing that this machine lacks."""
-        _check_machine()
-        return cls()
+        ready = cls()
+        ready.about = _machine()
+        return ready
 
     def rasterize(
         self,
@@ -175,17 +175,8 @@ class CudaBackend(Backend):
         overflow = self._overflow()
         return overflow is None or int(overflow) == 0
 
-    @classmethod
-    def status(cls) -> BackendStatus:
-        """Return the line for ``gs2d doctor``."""
-        lacking, words = diagnose.report()
-        if lacking is None:
-            return BackendStatus(cls.name, True, "", "", words)
-        return BackendStatus(cls.name, False, lacking.reason, lacking.remedy, "")
-
 
 @cache  # the machine is examined once; an error is not cached
-def _check_machine() -> None:
-    lacking, _ = diagnose.report()
-    if lacking is not None:
-        raise BackendError(f"backend 'cuda' cannot run: {lacking.reason}; {lacking.remedy}")
+def _machine() -> str:
+    """Return a line about this machine, or raise BackendError."""
+    return diagnose.machine()

@@ -128,8 +128,7 @@ with FakeTensorMode():
             there_and_back(cuda._CudaRasterize, needs, options, rand(9, columns), intrinsics, None, *splats)
         there_and_back(cuda._CudaRasterize, (*[False] * 8, True, True), options, None, None, None, *splats)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
-    mean = ops.blur(image, launcher=launcher)
-    there_and_back(ops._CudaPhotometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)
+    there_and_back(ops._CudaPhotometric, (True,), image, rand(24, 40, 3), mask, True, launcher)
     for form, weights in ((False, None), (True, plane)):
         how = NormalOptions(camera, mask, weights, form, form)
         there_and_back(ops._CudaNormalConsistency, (True, True, True), image, plane, plane, how, launcher)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -12,49 +12,63 @@ from fake_driver import FakeDriver
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda import diagnose
-from gs2d.kernels.cuda.diagnose import Facts, missing
 from gs2d.kernels.cuda.driver import own_default_stream
 from gs2d.render.backends import backend_report, get_backend
 
-H200 = ("NVIDIA H200", (9, 0))
-WORKS = Facts("2.15.0", (13, 0), nvrtc=(13, 0), driver=(13, 2), devices=(H200,))
+DIAGNOSE = "gs2d.kernels.cuda.diagnose"
+H200 = [("NVIDIA H200", (9, 0))]
+
+
+def says(answer: object) -> Callable[..., object]:
+    """Return a function with this answer; an error is raised."""
+
+    def function(*_: object) -> object:
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    return function
+
+
 # Everything is broken; each row of the table fixes one more cause.
-BROKEN = Facts(
-    "2.15.0+cpu",
-    None,
-    bindings_error="No module named 'cuda'",
-    nvrtc_error="libnvrtc not found",
-    driver_error="libcuda not found",
-    torch_error="no NVIDIA driver",
-    architecture_error="the GPU must have compute capability 7.5 or more (Turing, 2018), got 6.1; use --backend cpu",
-    cache_writable=False,
-)
+BROKEN = {
+    "torch.version.cuda": None,
+    f"{DIAGNOSE}.load_driver": says(BackendError("the Python package cuda.bindings is missing (no module); x")),
+    f"{DIAGNOSE}.nvrtc.nvrtc_version": says(BackendError("the CUDA compiler NVRTC is missing (no library); x")),
+    f"{DIAGNOSE}.driver_version": says(BackendError("no NVIDIA driver is installed (no libcuda); install NVIDIA's")),
+    f"{DIAGNOSE}.torch.cuda.is_available": says(False),
+    f"{DIAGNOSE}.nvrtc.architecture_for": says(BackendError("the GPU is too old; use --backend cpu")),
+    f"{DIAGNOSE}.own_default_stream": says(False),
+}
 MENDING = (
-    ({}, "torch 2.15.0+cpu is built without CUDA", "CUDA build of torch"),
-    ({"torch_cuda": (11, 8)}, "torch is built for CUDA 11.8, CUDA 12 or newer is needed", "for CUDA 12 or 13"),
+    ({}, "torch .* is built without CUDA; .*CUDA build of torch"),
+    ({"torch.version.cuda": "11.8"}, "torch is built for CUDA 11.8, CUDA 12 or newer is needed; .*for CUDA 12 or 13"),
     (
-        {"torch_cuda": (13, 0)},
-        "cuda.bindings is missing (No module named 'cuda')",
-        "pip install 'cuda-bindings>=13,<14' 'nvidia-cuda-nvrtc>=13,<14' (the extra cuda13;",
+        {"torch.version.cuda": "13.0"},
+        r"cuda.bindings is missing \(no module\); pip install 'cuda-bindings>=13,<14' .*\(the extra cuda13;",
     ),
-    ({"bindings_error": ""}, "NVRTC is missing (libnvrtc not found)", "'nvidia-cuda-nvrtc>=13,<14'"),
-    ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is installed (libcuda not found)", "NVIDIA's driver"),
-    ({"driver_error": "", "driver": (12, 4)}, "driver supports CUDA 12.4, but torch needs CUDA 13.0", "update"),
-    ({"torch_cuda": (12, 8)}, "driver supports CUDA 12.4, but NVRTC needs CUDA 13.0", "update"),
-    ({"nvrtc": (12, 9)}, "torch sees no CUDA device (no NVIDIA driver)", "CUDA_VISIBLE_DEVICES"),
-    ({"devices": (H200,)}, "NVIDIA H200: the GPU must have compute capability 7.5", "--backend cpu"),
+    ({f"{DIAGNOSE}.load_driver": says(None)}, r"NVRTC is missing \(no library\); .*'nvidia-cuda-nvrtc>=13,<14'"),
+    ({f"{DIAGNOSE}.nvrtc.nvrtc_version": says((13, 0))}, "no NVIDIA driver is installed"),
+    ({f"{DIAGNOSE}.driver_version": says((12, 4))}, "driver supports CUDA 12.4, but torch needs CUDA 13.0; update"),
+    ({"torch.version.cuda": "12.8"}, "driver supports CUDA 12.4, but NVRTC needs CUDA 13.0; update"),
+    ({f"{DIAGNOSE}.nvrtc.nvrtc_version": says((12, 9))}, "torch sees no CUDA device.*; .*CUDA_VISIBLE_DEVICES"),
+    ({f"{DIAGNOSE}.seen_devices": says(H200)}, "NVIDIA H200: the GPU is too old; use --backend cpu"),
 )
 
 
-def test_each_missing_piece_is_named_in_order_with_its_remedy() -> None:
-    facts = BROKEN
-    for change, reason, remedy in MENDING:
-        facts = replace(facts, **change)  # type: ignore[arg-type]
-        lacking = missing(facts)
-        assert lacking is not None, change
-        assert reason in lacking.reason
-        assert remedy in lacking.remedy
-    assert missing(replace(facts, architecture_error="")) is None
+def test_each_missing_piece_is_named_in_order_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    for place, value in BROKEN.items():
+        monkeypatch.setattr(place, value)
+    for change, line in MENDING:
+        for place, value in change.items():
+            monkeypatch.setattr(place, value)
+        with pytest.raises(BackendError, match=line):
+            diagnose.machine()
+    monkeypatch.setattr(f"{DIAGNOSE}.nvrtc.architecture_for", says("sm_90"))
+    assert diagnose.machine().startswith("NVIDIA H200 (sm_90); driver CUDA 12.4, NVRTC 12.9")
+    monkeypatch.setattr(f"{DIAGNOSE}.own_default_stream", says(True))
+    with pytest.raises(BackendError, match=r"CUDA_PYTHON_CUDA_PER_THREAD_DEFAULT_STREAM is set.*; unset it"):
+        diagnose.machine()
 
 
 @pytest.mark.parametrize(("value", "refused"), [(None, False), ("0", False), ("1", True)])
@@ -65,10 +79,7 @@ def test_bindings_that_mean_another_default_stream_than_torch_are_refused(
     name = "CUDA_PYTHON_CUDA_PER_THREAD_DEFAULT_STREAM"
     monkeypatch.setenv(name, value) if value else monkeypatch.delenv(name, raising=False)
     assert own_default_stream() == refused
-    lacking = missing(replace(WORKS, own_default_stream=own_default_stream()))
-    assert (lacking is not None) == refused
-    if lacking is not None:
-        assert (lacking.reason.startswith(name), lacking.remedy) == (True, "unset it")
+    if refused:
         with pytest.raises(BackendError, match=f"{name} is set.*unset it"):
             fake_driver.launcher(FakeDriver())
     else:
@@ -76,19 +87,13 @@ def test_bindings_that_mean_another_default_stream_than_torch_are_refused(
 
 
 @pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
-def test_facts_are_gathered_to_the_end_whatever_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A CUDA build of torch without driver or device: every field is filled in."""
+def test_the_backend_and_its_status_name_the_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CUDA build of torch without driver or device."""
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    facts = diagnose.gather()
-    assert facts.torch_cuda == (13, 0)
-    assert facts.devices == ()
-    assert bool(facts.driver_error) or bool(facts.bindings_error)
-    lacking = missing(facts)
-    assert lacking is not None
-    with pytest.raises(BackendError, match="backend 'cuda' cannot run"):
+    with pytest.raises(BackendError) as caught:
         get_backend("cuda")
     status = next(status for status in backend_report() if status.name == "cuda")
-    assert (status.reason, status.remedy) == (lacking.reason, lacking.remedy)
+    assert str(caught.value) == f"{status.reason}; {status.remedy}"
     assert "\n" not in status.reason
 
 

@@ -28,12 +28,12 @@ emulator = Emulator(**{sys.argv[2]: True})
 """
 
 BEYOND = """
-from gs2d.kernels.cuda.kernel_arguments import BlurArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import PhotometricArguments, fill
 
-arguments = BlurArguments(20, 20)
-image, out = torch.rand(20 * 20 * 3 - 1), torch.rand(20 * 20 * 3)  # one number too few
-fill(arguments, image=image, out=out)
-emulator.launch("blur_image", 1, 128, arguments)
+arguments = PhotometricArguments(20, 20)
+target, rendered = torch.rand(20 * 20 * 3 - 1), torch.rand(20 * 20 * 3)  # one number too few
+fill(arguments, rendered=rendered, target=target, partials=torch.rand(4))
+emulator.launch("photometric_forward", 1, 128, arguments)
 """
 
 EVERYTHING = """

@@ -20,6 +20,7 @@ from typing import Any
 import gs2d
 from gs2d.core.atomic_files import atomic_write
 from gs2d.errors import BackendError, DiskError
+from gs2d.kernels.cuda.driver import one_line
 
 __all__ = [
     "ARCHITECTURES",
@@ -125,7 +126,7 @@ def _nvrtc() -> Any:
 
         _check(nvrtc, nvrtc.nvrtcVersion()[0], "nvrtcVersion")  # loads the library
     except (ImportError, RuntimeError, OSError) as error:
-        raise BackendError(f"the CUDA compiler NVRTC is missing ({error}); {REMEDY}") from error
+        raise BackendError(f"the CUDA compiler NVRTC is missing ({one_line(error)}); {REMEDY}") from error
     return nvrtc
 
 

@@ -19,7 +19,6 @@ from torch.autograd.function import once_differentiable
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.kernel_arguments import (
-    BlurArguments,
     FinishArguments,
     MeanArguments,
     NormalArguments,
@@ -33,7 +32,7 @@ from gs2d.kernels.native_losses import NormalOptions, check_smoothness, needs_gr
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
 
-__all__ = ["blur", "masked_mean", "normal_consistency", "normal_smoothness", "photometric", "strips"]
+__all__ = ["masked_mean", "normal_consistency", "normal_smoothness", "photometric", "strips"]
 
 THREADS = 128
 STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows per block
@@ -79,21 +78,6 @@ def _finish(launcher: Launcher, partials: Tensor, *, complement: bool = False) -
     return means
 
 
-def blur(image: Tensor, *, launcher: Launcher) -> Tensor:
-    """Filter an image [H, W, 3] with the SSIM window (11x11 Gaussian, sigma 1.5, zero outside); not differentiable.
-
-    The result for a target is the ``target_mean`` of ``photometric``.
-    """
-    sizes = check_shapes({"image": (image, "H W 3")})
-    (source,) = ready(image=image)
-    out = torch.empty_like(source)
-    if source.numel() > 0:
-        arguments = BlurArguments(sizes["H"], sizes["W"])
-        fill(arguments, image=source, out=out)
-        launcher.launch("blur_image", strips(sizes["H"], sizes["W"]), THREADS, arguments)
-    return out
-
-
 class _CudaPhotometric(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -101,7 +85,6 @@ class _CudaPhotometric(torch.autograd.Function):
         rendered: Tensor,
         target: Tensor,
         mask: Tensor | None,
-        mean: Tensor | None,
         wanted: bool,
         launcher: Launcher,
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -111,10 +94,8 @@ class _CudaPhotometric(torch.autograd.Function):
         maps = rendered.new_empty(3, height, width, 3) if wanted else None
         if blocks > 0:
             arguments = PhotometricArguments(height, width)
-            images = {"rendered": rendered, "target": target, "mask": mask, "target_mean": mean}
-            fill(arguments, **images, maps=maps, partials=partials)
-            name = "photometric_forward" if mean is None else "photometric_forward_known"
-            launcher.launch(name, blocks, THREADS, arguments)
+            fill(arguments, rendered=rendered, target=target, mask=mask, maps=maps, partials=partials)
+            launcher.launch("photometric_forward", blocks, THREADS, arguments)
         means = _finish(launcher, partials)
         ctx.launcher = launcher
         ctx.set_materialize_grads(False)
@@ -133,7 +114,7 @@ class _CudaPhotometric(torch.autograd.Function):
             cotangents = dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, given), strict=True))
             fill(arguments, **cotangents)
             ctx.launcher.launch("photometric_vjp", strips(height, width), THREADS, arguments)
-        return gradient, None, None, None, None, None
+        return gradient, None, None, None, None
 
 
 def photometric(
@@ -153,10 +134,8 @@ def photometric(
         In [0, 1].
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
-    target_mean : Tensor [H, W, 3], optional
-        ``blur(target)``, to save time. Changes no bit of the result.
-    expected : (float, float, float)
-        Unused; any cotangents cost the same.
+    target_mean, expected
+        Unused.
     launcher : Launcher
         Launcher of the tensors' device.
 
@@ -170,16 +149,12 @@ def photometric(
     ShapeError
         If shapes, dtypes or devices differ.
     """
-    del expected
-    images = {"rendered": rendered, "target": target}
-    if target_mean is not None:
-        images["target_mean"] = target_mean
-    shapes = {name: (image, "H W 3") for name, image in images.items()}
+    del target_mean, expected
+    shapes = {"rendered": (rendered, "H W 3"), "target": (target, "H W 3")}
     check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
-    _, target, *known = ready(**images)
+    _, target = ready(rendered=rendered, target=target)
     mask = _mask_of(mask, rendered.device)
-    mean = known[0] if known else None
-    l1, ssim, l2 = _CudaPhotometric.apply(rendered.contiguous(), target, mask, mean, needs_gradient(rendered), launcher)
+    l1, ssim, l2 = _CudaPhotometric.apply(rendered.contiguous(), target, mask, needs_gradient(rendered), launcher)
     return l1, ssim, l2
 
 

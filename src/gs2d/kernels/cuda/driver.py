@@ -61,7 +61,9 @@ def load_driver() -> Any:
     try:
         from cuda.bindings import driver
     except (ImportError, RuntimeError, OSError) as error:
-        raise BackendError(f"the Python package cuda.bindings is missing ({error}); {BINDINGS_REMEDY}") from error
+        raise BackendError(
+            f"the Python package cuda.bindings is missing ({one_line(error)}); {BINDINGS_REMEDY}"
+        ) from error
     return driver
 
 

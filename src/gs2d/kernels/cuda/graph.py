@@ -9,20 +9,9 @@ import ctypes
 from collections.abc import Sequence
 from typing import Any
 
-from gs2d.errors import BackendError
-from gs2d.kernels.cuda.driver import call, driver_version, failure
+from gs2d.kernels.cuda.driver import call, failure
 
-__all__ = ["OLDEST_DRIVER", "Graph", "Work", "can_replay"]
-
-OLDEST_DRIVER = (12, 0)  # first version whose nodes accept a kernel of a library
-NEEDED = (
-    "CUDA_KERNEL_NODE_PARAMS",
-    "cuGraphCreate",
-    "cuGraphAddKernelNode",
-    "cuGraphInstantiate",
-    "cuGraphExecKernelNodeSetParams",
-    "cuGraphLaunch",
-)
+__all__ = ["Graph", "Work"]
 
 
 class Work:
@@ -44,16 +33,6 @@ class Work:
         self.name, self.blocks, self.threads, self.arguments = name, blocks, threads, arguments
         self._pointer = ctypes.c_void_p(ctypes.addressof(arguments))
         self.parameters = ctypes.addressof(self._pointer)  # address of the array of pointers for the driver
-
-
-def can_replay(driver: Any) -> bool:
-    """Whether the driver and its bindings support these graphs."""
-    if not all(hasattr(driver, name) for name in NEEDED):
-        return False
-    try:
-        return driver_version(driver) >= OLDEST_DRIVER
-    except BackendError:
-        return False
 
 
 class Graph:

@@ -14,7 +14,6 @@ __all__ = [
     "BlendArguments",
     "BlendColorsArguments",
     "BlendVjpArguments",
-    "BlurArguments",
     "ClearArguments",
     "DecodedTarget",
     "DepthArguments",
@@ -253,7 +252,7 @@ class PhotometricArguments(ctypes.Structure):
 
     _fields_ = (
         *_all(ctypes.c_int64, "height", "width"),
-        *_pointers("rendered", "target", "mask", "target_mean", "maps", "partials"),
+        *_pointers("rendered", "target", "mask", "maps", "partials"),
         ("photograph", DecodedTarget),
     )
 
@@ -267,12 +266,6 @@ class PhotometricVjpArguments(ctypes.Structure):
         ("photograph", DecodedTarget),
         *_all(ctypes.c_float, "l1_scale", "ssim_scale", "l2_scale"),
     )
-
-
-class BlurArguments(ctypes.Structure):
-    """Arguments of photometric.cu."""
-
-    _fields_ = (*_all(ctypes.c_int64, "height", "width"), *_pointers("image", "out"))
 
 
 class NormalArguments(ctypes.Structure):

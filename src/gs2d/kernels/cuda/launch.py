@@ -20,7 +20,7 @@ import torch
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda.driver import PER_THREAD, call, failure, load_driver, own_default_stream
-from gs2d.kernels.cuda.graph import Graph, Work, can_replay
+from gs2d.kernels.cuda.graph import Graph, Work
 
 __all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "launcher_for", "steps"]
 
@@ -111,7 +111,7 @@ class GpuLauncher:
         self._functions: dict[str, Any] = {}  # by kernel
         self._allowed: dict[str, int] = {}  # largest dynamic shared memory so far, by kernel
         self._lock = threading.Lock()  # the backward pass runs in another thread
-        self._replays = can_replay(self._driver)
+        self._replays = True
         self._graphs: dict[tuple[str, ...], Graph | int] = {}  # by kernel names; an int counts repetitions
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
@@ -140,8 +140,8 @@ class GpuLauncher:
     def run(self, works: Sequence[Work]) -> None:
         """Start kernels in order on the current stream without waiting.
 
-        From the third repetition on they run as a graph, if the driver supports it, which cuts the host's cost and the
-        gaps between kernels. Raises BackendError like :meth:`launch`.
+        From the third repetition on they run as a graph, if it can be made, which cuts the host's cost and the gaps
+        between kernels. Raises BackendError like :meth:`launch`.
         """
         if int(call(self._driver, "cuCtxGetCurrent")) == self._context_number:
             self._run(works)
@@ -181,7 +181,7 @@ class GpuLauncher:
                 known = self._graphs[names] = Graph(self._driver, kernels, works)
             else:
                 known.change(works)
-        except BackendError:  # an old driver or too little memory: launch one by one
+        except BackendError:  # too little memory: launch one by one
             self._replays = False
             self._graphs.clear()
             return None

@@ -22,7 +22,6 @@ struct PhotometricArguments {
     int64 height, width;
     const float *rendered, *target;  // [H, W, 3]
     const uchar* mask;               // [H, W], 0 = ignore; or null
-    const float* target_mean;        // [H, W, 3]: blur_image of the target; for variant `known`
     float* maps;                     // [3, H, W, 3]: derivatives of SSIM with respect to the blurred moments; or null
     float* partials;                 // [4, blocks]: valid reals, L1, SSIM, L2; or null
     Photograph photograph;
@@ -37,12 +36,6 @@ struct PhotometricVjpArguments {
     float* gradient;                    // [H, W, 3]
     Photograph photograph;
     float l1_scale, ssim_scale, l2_scale;  // cotangents / valid reals
-};
-
-struct BlurArguments {
-    int64 height, width;
-    const float* image;  // [H, W, 3]
-    float* out;
 };
 
 // Part of a thread: one column of reals, STRIP_ROWS rows.
@@ -124,7 +117,7 @@ __device__ __forceinline__ float target_of(const Arguments& a, int64 y, int64 co
     return (part_of_255(pixel[channel]) - behind) * part_of_255(pixel[3]) + behind;
 }
 
-template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photometric(const PhotometricArguments& a) {
+template <int CHANNELS> __device__ __forceinline__ void photometric(const PhotometricArguments& a) {
     __shared__ float rows[2][2][STAGED];
     const Strip s(a.height, a.width);
     const auto read = [&](int64 y) {
@@ -150,7 +143,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
             m = m + wu, q = fma(wu, u, fma(wv, v, q)), p = fma(wu, v, p);
         }
         mean.add(m), squares.add(q), product.add(p);
-        if constexpr (!KNOWN) target_mean.add(blur_row(row[1]));
+        target_mean.add(blur_row(row[1]));
         const float u = row[0][threadIdx.x + SIDE], v = row[1][threadIdx.x + SIDE];
         if (s.mine() && y >= s.begin && y < s.end) {
             sums[1] = sums[1] + abs(u - v);
@@ -158,8 +151,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
         }
         const int64 out = y - SSIM_RADIUS, at = out * s.n + s.column;
         if (out < s.begin || !s.mine()) continue;
-        const float b = KNOWN ? a.target_mean[at] : target_mean.done();
-        const SsimPoint<float> point = ssim_point(mean.done(), b, squares.done(), product.done());
+        const SsimPoint<float> point = ssim_point(mean.done(), target_mean.done(), squares.done(), product.done());
         const bool valid = is_valid(a.mask, out, a.width, s.column);
         sums[0] = sums[0] + float(valid), sums[2] = sums[2] + keep(valid, point.value);
         if (!a.maps) continue;
@@ -171,15 +163,10 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
     if (a.partials) leave_sums(sums, a.partials);  // uniform over the grid
 }
 
-extern "C" __global__ void __launch_bounds__(128) photometric_forward(PhotometricArguments a) { photometric<false>(a); }
-extern "C" __global__ void __launch_bounds__(128) photometric_forward_known(PhotometricArguments a) {
-    photometric<true>(a);
-}
-extern "C" __global__ void __launch_bounds__(128) photometric_forward_rgb(PhotometricArguments a) {
-    photometric<false, 3>(a);
-}
+extern "C" __global__ void __launch_bounds__(128) photometric_forward(PhotometricArguments a) { photometric<0>(a); }
+extern "C" __global__ void __launch_bounds__(128) photometric_forward_rgb(PhotometricArguments a) { photometric<3>(a); }
 extern "C" __global__ void __launch_bounds__(128) photometric_forward_rgba(PhotometricArguments a) {
-    photometric<false, 4>(a);
+    photometric<4>(a);
 }
 
 // dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product) for SSIM, the sign of x - y for L1, 2 (x - y) for L2.
@@ -222,26 +209,5 @@ template <int CHANNELS> __device__ __forceinline__ void gradient_of(const Photom
 extern "C" __global__ void __launch_bounds__(128) photometric_vjp(PhotometricVjpArguments a) { gradient_of<0>(a); }
 extern "C" __global__ void __launch_bounds__(128) photometric_vjp_rgb(PhotometricVjpArguments a) { gradient_of<3>(a); }
 extern "C" __global__ void __launch_bounds__(128) photometric_vjp_rgba(PhotometricVjpArguments a) { gradient_of<4>(a); }
-
-// Applies the window to an image, zero outside; bit-identical to the target blur of photometric_forward.
-extern "C" __global__ void __launch_bounds__(128) blur_image(BlurArguments a) {
-    __shared__ float rows[2][1][STAGED];
-    const Strip s(a.height, a.width);
-    const auto read = [&](int64 y) {
-        return [&a, &s, y](int64 column, float* value) { value[0] = a.image[y * s.n + column]; };
-    };
-    RunningBlur blurred;
-    Staging<1> next;
-    next.load(s, s.begin - SSIM_RADIUS, read(s.begin - SSIM_RADIUS));
-    for (int64 y = s.begin - SSIM_RADIUS; y < s.end + SSIM_RADIUS; ++y) {
-        float (*row)[STAGED] = rows[y & 1];
-        next.store(row);
-        __syncthreads();
-        next.load(s, y + 1, read(y + 1));
-        blurred.add(blur_row(row[0]));
-        const int64 out = y - SSIM_RADIUS;
-        if (out >= s.begin && s.mine()) a.out[out * s.n + s.column] = blurred.done();
-    }
-}
 
 }  // namespace gs2d
