@@ -281,11 +281,16 @@ def splat_errors(
     arrays: dict[str, tuple[Tensor, str]] = {"image": (image, f"{H} {W} 3")}
     if mask is not None:
         arrays["mask"] = (mask, f"{H} {W}")
-        if mask.dtype != torch.bool:
-            raise ShapeError(f"mask must be bool (False = ignore), got {mask.dtype}")
+        if mask.dtype != torch.bool or mask.device != splats.device:
+            raise ShapeError(
+                f"mask must be bool (False = ignore) on {splats.device}, got {mask.dtype} on {mask.device}"
+            )
     check_shapes(arrays)
-    if image.dtype != splats.dtype:
-        raise ShapeError(f"image must be {splats.dtype} like the splats, in [0, 1], got {image.dtype}")
+    if (image.dtype, image.device) != (splats.dtype, splats.device):
+        raise ShapeError(
+            f"image must be {splats.dtype} on {splats.device} like the splats, in [0, 1], got {image.dtype} on "
+            f"{image.device}"
+        )
     return chosen.splat_errors(splats, camera, image, settings, mask, occlusion)
 
 

@@ -213,9 +213,6 @@ def rasterize_with(
     """
     _check_tensors(splats, settings)
     if gradient_rows is not None:
-        found = (tuple(gradient_rows.shape), gradient_rows.dtype, gradient_rows.device)
-        if found != ((len(splats),), torch.bool, splats.device):
-            raise ShapeError(f"gradient_rows must be bool [{len(splats)}] on {splats.device}, got {found}")
         gradient_rows = gradient_rows.clone()  # it may change before the backward pass
     deterministic = choices.deterministic
     if deterministic is None:
@@ -256,19 +253,9 @@ def splat_errors_with(
     Raises
     ------
     ShapeError, BackendError
-        As for :func:`rasterize_with`; also if image or mask have another shape or dtype.
+        As for :func:`rasterize_with`.
     """
     _check_tensors(splats, settings)
-    size = (camera.height, camera.width)
-    if tuple(image.shape) != (*size, 3) or image.dtype != torch.float32 or image.device != splats.device:
-        raise ShapeError(
-            f"image must be {[*size, 3]} float32 on {splats.device}, got {list(image.shape)} {image.dtype} "
-            f"on {image.device}"
-        )
-    if mask is not None and (tuple(mask.shape) != size or mask.dtype != torch.bool or mask.device != splats.device):
-        raise ShapeError(
-            f"mask must be {list(size)} bool on {splats.device}, got {list(mask.shape)} {mask.dtype} on {mask.device}"
-        )
     parameters = [t.detach().contiguous() for _, t in splats.items()]
     image, mask = image.detach().contiguous(), None if mask is None else mask.contiguous()
     return errors(launcher, _view(camera, settings), parameters, image, mask, occlusion)

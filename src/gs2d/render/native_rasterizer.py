@@ -310,10 +310,6 @@ def rasterize_with(
     """
     check_tensors(splats, settings, library.dtype)
     if gradient_rows is not None:
-        if tuple(gradient_rows.shape) != (len(splats),) or gradient_rows.dtype != torch.bool:
-            raise ShapeError(
-                f"gradient_rows must be bool [{len(splats)}], got {gradient_rows.dtype} {list(gradient_rows.shape)}"
-            )
         gradient_rows = gradient_rows.to("cpu", copy=True).contiguous()  # it may change before the backward pass
     depth_width = settings.depth_width(camera) if settings.with_transmittance_depth else None
     view = view_of(camera, settings, exact_masks)
@@ -341,14 +337,6 @@ def splat_errors_with(
     ``library`` and ``exact_masks`` are as for :func:`rasterize_with`.
     """
     check_tensors(splats, settings, library.dtype)
-    expected = (camera.height, camera.width, 3)
-    if tuple(image.shape) != expected or image.dtype != library.dtype or image.device.type != "cpu":
-        raise ShapeError(
-            f"image must be {list(expected)} {library.dtype} on the CPU, got {list(image.shape)} {image.dtype} "
-            f"on {image.device}"
-        )
-    if mask is not None and (tuple(mask.shape) != expected[:2] or mask.dtype != torch.bool):
-        raise ShapeError(f"mask must be bool {list(expected[:2])}, got {mask.dtype} {list(mask.shape)}")
     tensors = [t.detach().contiguous() for _, t in splats.items()]
     image = image.detach().contiguous()
     mask = None if mask is None else mask.contiguous()
