@@ -69,7 +69,7 @@ def extract_delaunay(
         As for ``extract``. ``voxel`` is also half the distance of the points; ``max_bytes`` limits their number.
     threads : int, optional
     backend : str or Backend
-        Of the fusion. With ``"reference"``, all steps run in numpy and SciPy.
+        Of the fusion.
 
     Returns
     -------

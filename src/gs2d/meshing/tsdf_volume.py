@@ -13,7 +13,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from typing import NoReturn
 
 import numpy as np
 import torch
@@ -29,8 +28,7 @@ from gs2d.render.backends import Backend, get_backend
 # -- the volume --------------------------------------------------------------------------------------------------------
 BLOCK = 8  # voxels along the side of a block
 VOXELS = BLOCK**3
-MAX_BLOCKS = 2**32  # of a box; finding the touched ones needs a byte of address space for each
-_ALL_OF_LEAST = 16  # all blocks of a scene / lower bound for one view; 5 to 15 in measured scenes
+MAX_BLOCKS = 2**30  # of a box; finding the touched ones takes up to a byte for each
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,21 +143,10 @@ class Budget:
         need = blocks * block_bytes(colored)
         if need <= self.max_bytes or (partial and need <= 16 * self.max_bytes):
             return
-        self._refuse(need, need, "at least " if partial else "")
-
-    def check_least(self, blocks: int, colored: bool) -> None:
-        """Raise if a lower bound for one view exceeds the limit, because counting could take very long.
-
-        The suggested voxel is an estimate.
-        """
-        need = blocks * block_bytes(colored)
-        if need > self.max_bytes:
-            self._refuse(need, _ALL_OF_LEAST * need, "at least ")
-
-    def _refuse(self, need: int, expected: int, least: str) -> NoReturn:
-        voxel = self.limits.voxel * (expected / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
+        voxel = self.limits.voxel * (need / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
         if self.side is not None:
             voxel = 1.005 * self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
+        least = "at least " if partial else ""
         raise VolumeTooLargeError(
             voxel,
             f"expected a volume of at most {self.max_bytes / 2**30:.3g} GiB, voxels of {self.limits.voxel:.4g} world "
@@ -311,7 +298,6 @@ def _volume_arrays(volume: Volume) -> dict[str, np.ndarray | None]:
 
 
 # -- all views ---------------------------------------------------------------------------------------------------------
-_FEW_SAMPLES = 1e8  # of one depth map; takes seconds
 
 
 def fuse(
@@ -394,7 +380,6 @@ def find_blocks(
     colored, count = False, 0
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
-        budget.check_least(min_blocks(item, limits), colored)
         keys = merged(keys, touched_blocks(item, limits, dims, threads))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
@@ -438,29 +423,6 @@ def box_corners(volume: Volume) -> np.ndarray:
     blocks, size = volume.blocks, BLOCK * volume.limits.voxel
     box = np.array([blocks.min(axis=0) * size, (blocks.max(axis=0) + 1) * size]) + np.asarray(volume.limits.lower)
     return np.array([[box[c >> axis & 1, axis] for axis in range(3)] for c in range(8)])
-
-
-def min_blocks(item: DepthMap, limits: FusionBounds) -> int:
-    """Return a lower bound for the number of ``touched_blocks``, without their cost for small voxels; 0 if it is low.
-
-    Pixels cover disjoint pieces of space of (z1^3 - z0^3) / (3 fx fy), one truncation in front of and behind the
-    surface and inside the box, and a block covers b^3. The surface has at least d^2 / (fx fy) per pixel, seen face-on,
-    and the projection of a block at most sqrt(3) b^2.
-    """
-    rows, columns = np.nonzero((item.depth > 0) & (item.depth <= limits.depth_limit))
-    depth = item.depth[rows, columns].astype(np.float64)
-    parts, steps = _samples(item, depth, limits)
-    if len(rows) * parts**2 * steps < _FEW_SAMPLES:
-        return 0
-    center, focal2, block = item.camera.center, item.camera.fx * item.camera.fy, BLOCK * limits.voxel
-    ray = backproject(item.camera, np.ones(len(rows)), rows, columns) - center  # to depth 1
-    with np.errstate(divide="ignore", invalid="ignore"):  # a ray along an axis
-        sides = np.stack([(limits.lower - center) / ray, (limits.upper - center) / ray])
-    near = np.fmax(sides.min(axis=0).max(axis=1), np.maximum(depth - limits.truncation, 0))
-    far = np.fmin(sides.max(axis=0).min(axis=1), depth + limits.truncation)
-    volume = float(np.maximum(far**3 - near**3, 0).sum()) / (3 * focal2)
-    area = float((depth[(near <= depth) & (depth <= far)] ** 2).sum()) / focal2
-    return int(max(volume / block**3, area / (3**0.5 * block**2)))
 
 
 def _samples(item: DepthMap, depth: np.ndarray, limits: FusionBounds) -> tuple[int, int]:

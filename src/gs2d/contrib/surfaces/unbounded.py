@@ -53,11 +53,11 @@ from gs2d.meshing.tsdf_volume import (
     Volume,
     VolumeBlocks,
     add_all,
+    block_grid,
     check_truncation,
     fusion_backend,
     invalid_volume,
     merged,
-    min_blocks,
     touched_blocks,
 )
 from gs2d.render.backends import Backend
@@ -220,12 +220,12 @@ def find_cascade_blocks(
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(cascade.levels[0])
+    block_grid(cascade.levels[0])  # refuses voxels that are too small
     budget = Budget(cascade.levels[0], max_bytes, side=2 * cascade.half, step=STEP)
     keys = [np.zeros(0, dtype=np.int64) for _ in cascade.levels]
     colored, count = False, 0
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
-        budget.check_least(min_blocks(item, cascade.levels[0]), colored)
         for k, found in enumerate(_touched(item, cascade, threads)):
             keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)

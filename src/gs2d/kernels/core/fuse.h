@@ -1,6 +1,5 @@
-// Update of one voxel of a truncated signed distance field by one depth map (docs/math.md). meshing/tsdf_volume.py and
-// meshing/sampling.py contain the same operations in numpy. Results in single precision are bit-identical, so nothing
-// here is a fused multiply-add.
+// Update of one voxel of a truncated signed distance field by one depth map (docs/math.md), for meshing/tsdf_volume.py.
+// Results in single precision are bit-identical on every processor, so nothing here is a fused multiply-add.
 #pragma once
 
 #include "core/base.h"

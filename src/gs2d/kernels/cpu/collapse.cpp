@@ -1,4 +1,4 @@
-// Edge collapse by quadric errors; the same in Python, with the formulas: meshing/simplify.py.
+// Edge collapse by quadric errors; formulas: meshing/simplify.py.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

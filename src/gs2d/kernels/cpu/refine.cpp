@@ -1,4 +1,4 @@
-// Photometric refinement of a mesh (docs/math.md, "Mesh refinement"; numpy version: meshing/warped_ncc.py).
+// Photometric refinement of a mesh (docs/math.md, "Mesh refinement"), for meshing/warped_ncc.py.
 //
 // gs2d_raster_mesh draws the depth of a mesh, gs2d_match_views compares an image with a neighbour that is warped through
 // this depth, and gs2d_gather_vertices adds the result up on the vertices. Rows are independent in the first two, and the
