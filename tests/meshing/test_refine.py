@@ -21,9 +21,8 @@ from gs2d.meshing.warped_ncc import (
     DrawnMesh,
     GreyImage,
     MatchSettings,
-    PixelPull,
+    Pull,
     Surface,
-    VertexPull,
     brightness_share,
     draw_mesh,
     gather_vertices,
@@ -86,15 +85,15 @@ def photograph(mesh: Mesh, camera: Camera) -> GreyImage:
 
 def pulled(
     vertices: np.ndarray, pair: tuple[GreyImage, GreyImage], settings: MatchSettings, library: Library
-) -> tuple[float, VertexPull]:
+) -> tuple[float, Pull]:
     """Return the energy of one pair, and its derivatives by the heights of a sheet's vertices."""
     faces, view, other = sheet().faces, *pair
     here, there = (draw_mesh(vertices, faces, item.camera, library) for item in pair)
     dtype = np.float32 if library.dtype.itemsize == 4 else np.float64
-    by_pixel = PixelPull.zeros(view.camera, dtype)
+    by_pixel = Pull.zeros(here.depth.shape, dtype)
     match_views(view, other, here.depth, there.depth, settings, by_pixel, library)
     surface = Surface(vertices, faces, np.tile([0.0, 0, 1], (len(vertices), 1)))
-    pull = VertexPull.zeros(len(vertices))
+    pull = Pull.zeros(len(vertices))
     gather_vertices(surface, view.camera, here.face, by_pixel, pull, settings, library)
     return float(by_pixel.sums[0]), pull
 
@@ -146,7 +145,7 @@ def test_occluded_and_masked_pixels_pull_nothing(fast: Library) -> None:
         assert not pulled(vertices, (view, nothing), EVERYTHING, fast)[1].gradient.any()
     faces, camera = sheet().faces, pair[0].camera
     drawn = draw_mesh(vertices, faces, camera, fast)
-    by_pixel = PixelPull.zeros(camera)
+    by_pixel = Pull.zeros(drawn.depth.shape, np.float32)
     match_views(*pair, drawn.depth, 0.4 * drawn.depth, EVERYTHING, by_pixel, fast)  # something is in front
     assert not by_pixel.gradient.any()
 

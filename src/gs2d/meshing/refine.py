@@ -36,9 +36,8 @@ from gs2d.meshing.warped_ncc import (
     DrawnMesh,
     GreyImage,
     MatchSettings,
-    PixelPull,
+    Pull,
     Surface,
-    VertexPull,
     brightness_share,
     draw_mesh,
     gather_vertices,
@@ -53,6 +52,22 @@ SPREAD = 0.6  # standard deviation of the logarithm of good angles
 LEAST_GAIN = 0.02  # of the points: a neighbour must add as much
 TINY = 1e-12
 REPEATED = 0.6  # a point that a perfect neighbour sees loses this fraction of its value for further ones
+COARSE_SIDE = 350  # px, shorter side of the first images
+LEAST_ANGLE, BEST_ANGLE, MOST_ANGLE = 4.0, 14.0, 35.0  # degrees between the rays of two views to a surface point
+BENDING, MEMBRANE, TETHER = 12.0, 0.01, 0.03
+"""Weights of the curvature, of differences between the steps of neighbouring vertices, and of the distance from the
+start. Independent of the size of the scene and of the images."""
+SMOOTH_RINGS = 6  # of neighbours: the mean of the curvature over them is kept, so bends and edges stay, noise does not
+LONGEST_STEP = 1.0  # px, of a vertex
+SOLVER_STEPS = 60  # iterations of the solver in a step, at most
+TOLERANCE = 1e-3  # relative residual at which it stops
+MATT, SHINY = 0.1, 0.2
+"""Share of brightness in the differences of photographs, see ``brightness_share``: up to MATT, a vertex keeps its whole
+move, from SHINY on none. Its median is 0.08 on stone, 0.12 on boxes and in a room, 0.5 on metal."""
+RARELY, OFTEN = 0.1, 0.3
+"""Part of the pixels of a vertex that can be compared, away from outlines and seen by the neighbour: up to RARELY, a
+vertex keeps nothing of its move, from OFTEN on all. Rods, wires and leaves have few of them."""
+KEPT_RINGS = 24  # both are averaged over as many rings: shiny things have matt-looking spots
 
 ReadGrey = Callable[[int, int], GreyImage]
 """Reads photograph ``index``, downscaled by an integer factor."""
@@ -66,61 +81,23 @@ class RefineSettings:
     ----------
     factors : tuple of int
         The photographs are downscaled by these factors, one after the other. Empty: down to a shorter side of
-        ``coarse_side``.
-    coarse_side : int, px
+        ``COARSE_SIDE``.
     steps : int
         Gauss-Newton steps at each of them.
     neighbours : int
         Views that each view is compared with, at most.
-    least_angle, best_angle, most_angle : float, degrees
-        Between the rays of two views to a surface point.
     face_pixels : float
         Mean number of pixels of a face after simplification.
     split_pixels : float
         Number of pixels of the largest faces.
-    bending, membrane, tether : float
-        Weights of the curvature, of differences between the steps of neighbouring vertices, and of the distance from
-        the start. Independent of the size of the scene and of the images.
-    longest_step : float, px
-        Of a vertex.
-    smooth : int
-        The curvature to keep is averaged over this number of rings of neighbours: bends and edges stay, noise does not.
-    matt, shiny : float
-        Share of brightness in the differences of photographs, see ``brightness_share``: up to ``matt``, a vertex keeps
-        its whole move, from ``shiny`` on none. Its median is 0.08 on stone, 0.12 on boxes and in a room, 0.5 on metal.
-    rarely, often : float
-        Part of the pixels of a vertex that can be compared, away from outlines and seen by the neighbour: up to
-        ``rarely``, a vertex keeps nothing of its move, from ``often`` on all. Rods, wires and leaves have few of them.
-    kept_rings : int
-        Both are averaged over as many rings: shiny things have matt-looking spots.
-    solver_steps : int
-        Iterations of the solver in a step.
-    tolerance : float
-        Relative residual at which it stops.
     match : MatchSettings
     """
 
     factors: tuple[int, ...] = ()
-    coarse_side: int = 350
     steps: int = 6
     neighbours: int = 3
-    least_angle: float = 4.0
-    best_angle: float = 14.0
-    most_angle: float = 35.0
     face_pixels: float = 1.5
     split_pixels: float = 6.0
-    bending: float = 12.0
-    membrane: float = 0.01
-    tether: float = 0.03
-    longest_step: float = 1.0
-    solver_steps: int = 60
-    smooth: int = 6
-    matt: float = 0.1
-    shiny: float = 0.2
-    rarely: float = 0.1
-    often: float = 0.3
-    kept_rings: int = 24
-    tolerance: float = 1e-3
     match: MatchSettings = field(default_factory=MatchSettings)
 
 
@@ -219,7 +196,7 @@ class Refinement:
     ) -> None:
         self._mesh, self._cameras, self._photographs = mesh, list(cameras), photographs
         self._settings, self._library = settings, library
-        self._factors = settings.factors or coarse_to_fine(self._cameras, settings.coarse_side)
+        self._factors = settings.factors or coarse_to_fine(self._cameras, COARSE_SIDE)
         self._room = cache_bytes(CACHE_BYTES) // 3  # for photographs, for their usable pixels and for depth maps
         self._done = 0
         rounds = settings.steps * sum(self._cost(factor) for factor in self._factors) + self._cost(self._factors[0])
@@ -285,7 +262,7 @@ class Refinement:
         cameras = [camera.downscaled(factor) for camera in self._cameras]
         photographs = _Kept(lambda index: self._photographs(index, factor), self._room)
         curvature = Curvature.of(now.vertices, now.faces, now.normals())
-        bend = curvature.smooth(self._settings.smooth)
+        bend = curvature.smooth(SMOOTH_RINGS)
 
         def views(surface: Surface) -> Iterator[_ComparedView]:
             for view in self._views(surface, cameras, photographs, neighbours):
@@ -320,12 +297,12 @@ class Refinement:
             beside = [(images(other), drawn(other).depth) for other in neighbours[index]]
             yield _ComparedView(images(index), drawn(index), beside)
 
-    def _pulled(self, surface: Surface, views: Iterable[_ComparedView]) -> VertexPull:
+    def _pulled(self, surface: Surface, views: Iterable[_ComparedView]) -> Pull:
         """Return the derivatives of all pairs."""
-        match, pull = self._settings.match, VertexPull.zeros(len(surface.vertices))
+        match, pull = self._settings.match, Pull.zeros(len(surface.vertices))
         for view in views:
             camera, drawn = view.image.camera, view.drawn
-            by_pixel = PixelPull.zeros(camera, drawn.depth.dtype)
+            by_pixel = Pull.zeros(drawn.depth.shape, drawn.depth.dtype)
             for other, depth in view.neighbours:
                 match_views(view.image, other, drawn.depth, depth, match, by_pixel, self._library)
             gather_vertices(surface, camera, drawn.face, by_pixel, pull, match, self._library)
@@ -344,28 +321,26 @@ class Refinement:
                 for total, values in zip(sums, (np.nan_to_num(share) * weight, weight, compared, at), strict=True):
                     total += np.bincount(drawn.face[at], values[at], len(faces))
         bright, textured, compared, drawn_pixels = (
-            curvature.spread(
-                np.bincount(faces.ravel(), np.repeat(total, 3), len(surface.vertices)), settings.kept_rings
-            )
+            curvature.spread(np.bincount(faces.ravel(), np.repeat(total, 3), len(surface.vertices)), KEPT_RINGS)
             for total in sums
         )
         shine = bright / np.maximum(textured, TINY)
         often = compared / np.maximum(drawn_pixels, TINY)
-        matt = np.clip((settings.shiny - shine) / (settings.shiny - settings.matt), 0.0, 1.0)
-        return matt * np.clip((often - settings.rarely) / (settings.often - settings.rarely), 0.0, 1.0)
+        matt = np.clip((SHINY - shine) / (SHINY - MATT), 0.0, 1.0)
+        return matt * np.clip((often - RARELY) / (OFTEN - RARELY), 0.0, 1.0)
 
-    def _moved(self, now: _Moving, factor: int, normals: np.ndarray, pull: VertexPull, bend: np.ndarray) -> _Moving:
+    def _moved(self, now: _Moving, factor: int, normals: np.ndarray, pull: Pull, bend: np.ndarray) -> _Moving:
         """Take one Gauss-Newton step; ``bend`` [P] is the curvature to keep."""
-        settings, size = self._settings, factor * now.size
+        size = factor * now.size
         curvature = Curvature.of(now.vertices, now.faces, normals)
-        stiff = csr_array(curvature.change.T @ diags_array(settings.bending * curvature.areas))
-        hold = settings.tether * curvature.areas / size**4
+        stiff = csr_array(curvature.change.T @ diags_array(BENDING * curvature.areas))
+        hold = TETHER * curvature.areas / size**4
         away = ((now.vertices - now.start) * normals).sum(axis=1)
-        joint = diags_array(np.sqrt(settings.membrane) / size)
+        joint = diags_array(np.sqrt(MEMBRANE) / size)
         matrix = stiff @ curvature.change + joint @ curvature.graph @ joint + diags_array(pull.curvature + hold)
         right = -(pull.gradient + stiff @ (curvature.values - bend) + hold * away)
-        step = solve(csr_array(matrix), right, steps=settings.solver_steps, tolerance=settings.tolerance)
-        longest = settings.longest_step * size
+        step = solve(csr_array(matrix), right, steps=SOLVER_STEPS, tolerance=TOLERANCE)
+        longest = LONGEST_STEP * size
         return replace(now, vertices=now.vertices + normals * np.clip(step, -longest, longest)[:, None])
 
 
@@ -400,10 +375,10 @@ def choose_neighbours(
             cosine = (rays * back).sum(axis=1) / np.maximum(distance * length, 1e-300)
             angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
             good = _visible(points, there, drawn[other].depth)
-            good &= (angle >= settings.least_angle) & (angle <= settings.most_angle)
+            good &= (angle >= LEAST_ANGLE) & (angle <= MOST_ANGLE)
             facing = np.clip(-(normals * back).sum(axis=1) / np.maximum(length, 1e-300), 0, 1)
             finer = distance * there.fx / np.maximum(length * camera.fx, 1e-300)
-            likely = np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / settings.best_angle) / SPREAD) ** 2)
+            likely = np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / BEST_ANGLE) / SPREAD) ** 2)
             scores[other] = np.where(good, likely * facing * np.minimum(finer, 1 / np.maximum(finer, 1e-9)), 0)
         found.append(_best(scores, settings.neighbours))
     return found

@@ -14,7 +14,7 @@ docs/math.md, "Mesh refinement"; code: ``kernels/cpu/refine.cpp``.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -126,43 +126,28 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class PixelPull:
-    """Derivative and curvature of the energy by the depth of each pixel, and its sums.
+class Pull:
+    """Derivative and curvature of the energy, by the depth of each pixel or by the distance of vertices along normals.
 
     Attributes
     ----------
-    gradient, curvature : ndarray [H, W] float
+    gradient, curvature : ndarray [H, W] or [P] float
         By world units, and by their square.
     sums : ndarray [2] float64
-        Of w (1 - NCC) and of w.
+        Of w (1 - NCC) and of w; of pixels alone.
     """
 
     gradient: np.ndarray
     curvature: np.ndarray
-    sums: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    sums: np.ndarray
 
     @classmethod
-    def zeros(cls, camera: Camera, dtype: np.dtype[Any] | type | str = np.float32) -> PixelPull:
-        """Return zeros for the pixels of a camera."""
-        return cls(*(np.zeros((camera.height, camera.width), dtype) for _ in range(2)))
+    def zeros(cls, shape: int | tuple[int, ...], dtype: np.dtype[Any] | type | str = np.float64) -> Pull:
+        """Return zeros for pixels [H, W], or for a number of vertices."""
+        return cls(np.zeros(shape, dtype), np.zeros(shape, dtype), np.zeros(2))
 
 
-@dataclass(frozen=True, eq=False)
-class VertexPull:
-    """Derivative and curvature of the energy by the distance of each vertex along its normal, [P] float64."""
-
-    gradient: np.ndarray
-    curvature: np.ndarray
-
-    @classmethod
-    def zeros(cls, count: int) -> VertexPull:
-        """Return zeros for ``count`` vertices."""
-        return cls(np.zeros(count), np.zeros(count))
-
-
-def draw_mesh(
-    vertices: np.ndarray, faces: np.ndarray, camera: Camera, library: Library, *, near: float = NEAR
-) -> DrawnMesh:
+def draw_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera, library: Library) -> DrawnMesh:
     """Draw the depth of a mesh.
 
     Parameters
@@ -171,10 +156,8 @@ def draw_mesh(
     faces : ndarray [F, 3] int32
     camera : Camera
     library : Library
-    near : float, world units
-        Nearer faces are left out.
     """
-    return DrawnMesh(*draw_on_cpu(library, vertices, faces, camera, near))
+    return DrawnMesh(*draw_on_cpu(library, vertices, faces, camera, NEAR))
 
 
 def match_views(
@@ -183,7 +166,7 @@ def match_views(
     depth: np.ndarray,
     other_depth: np.ndarray,
     settings: MatchSettings,
-    into: PixelPull,
+    into: Pull,
     library: Library,
 ) -> np.ndarray:
     """Compare a view with a neighbour and add the derivatives by the depth of its pixels to ``into``.
@@ -194,7 +177,7 @@ def match_views(
     depth, other_depth : ndarray [H, W], [h, w] world units
         Depth of the mesh in both; 0 without a surface.
     settings : MatchSettings
-    into : PixelPull
+    into : Pull
     library : Library
         The arrays have its precision.
 
@@ -258,7 +241,7 @@ def brightness_share(
     share, weight : ndarray [H, W] float64
         Where the images cannot be compared, NaN and 0. The weight is that of texture in :func:`match_views`.
     """
-    into = PixelPull.zeros(view.camera, f"f{library.dtype.itemsize}")
+    into = Pull.zeros(depth.shape, f"f{library.dtype.itemsize}")
     planes = match_views(view, other, depth, other_depth, settings, into, library)
     visible = planes[VISIBLE] > 0
     seen = visible.astype(np.float64)
@@ -282,8 +265,8 @@ def gather_vertices(
     surface: Surface,
     camera: Camera,
     face: np.ndarray,
-    pull: PixelPull,
-    into: VertexPull,
+    pull: Pull,
+    into: Pull,
     settings: MatchSettings,
     library: Library,
 ) -> None:
@@ -298,8 +281,8 @@ def gather_vertices(
     camera : Camera
     face : ndarray [H, W] int32
         Of :class:`DrawnMesh`.
-    pull : PixelPull
-    into : VertexPull
+    pull : Pull
+    into : Pull
     settings : MatchSettings
     library : Library
     """
