@@ -30,8 +30,9 @@ from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.evidence import gather
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths, widen_truncation
-from gs2d.meshing.marching_cubes import keep_components, marching_cubes
-from gs2d.meshing.tsdf_volume import VolumeBlocks, find_blocks, fuse_blocks, fusion_backend
+from gs2d.meshing.marching_cubes import keep_components
+from gs2d.meshing.slabs import fused_surface
+from gs2d.meshing.tsdf_volume import VolumeBlocks, find_blocks, fusion_backend
 
 RADIUS = 0.9
 T = TypeVar("T")
@@ -110,8 +111,7 @@ def run(
         )
     else:
         levels = timed("blocks", lambda: (find_blocks(maps, limits, threads=threads),))
-        volume = timed("fuse", lambda: fuse_blocks(maps, limits, levels[0], threads=threads, backend=backend))
-        mesh = timed("marching cubes", lambda: marching_cubes(volume))
+        mesh = timed("fuse", lambda: fused_surface(maps, limits, levels[0], threads=threads, backend=backend))
     mesh = timed("components", lambda: keep_components(mesh))
     timed("evidence", lambda: gather(mesh, maps, limits.truncation))
     error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() / limits.voxel

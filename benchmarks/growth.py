@@ -36,8 +36,9 @@ from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.evaluation.image_metrics import image_metrics
 from gs2d.kernels.library import load
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
-from gs2d.meshing.marching_cubes import keep_components, marching_cubes
-from gs2d.meshing.tsdf_volume import fuse
+from gs2d.meshing.marching_cubes import keep_components
+from gs2d.meshing.slabs import fused_surface
+from gs2d.meshing.tsdf_volume import find_blocks
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.training.actions.clone_in_place import CloneInPlace
 from gs2d.training.actions.entry_action import StageEntry
@@ -126,7 +127,7 @@ def meshing(width: int, height: int) -> Step:
     limits = derive_limits([sample_depths(m) for m in maps], [m.camera for m in maps], resolution=width // 4)
 
     def step() -> None:
-        keep_components(marching_cubes(fuse(maps, limits, threads=1)))
+        keep_components(fused_surface(maps, limits, find_blocks(maps, limits, threads=1), threads=1))
 
     return step
 

@@ -42,7 +42,7 @@ def volumes_of(cascade: TsdfCascade, field: Callable[[np.ndarray], np.ndarray]) 
         keys = (blocks[:, 0] * cascade.dims[1] + blocks[:, 1]) * cascade.dims[2] + blocks[:, 2]
         at = np.asarray(limits.lower) + (blocks[:, None] * BLOCK + local) * limits.voxel
         tsdf = np.clip(field(at.reshape(-1, 3)).reshape(-1, VOXELS) / limits.truncation, -1, 1).astype(np.float32)
-        volumes.append(Volume(limits, cascade.dims, keys, tsdf, np.ones_like(tsdf), None, None, 1))
+        volumes.append(Volume(limits, cascade.dims, keys, tsdf, np.ones_like(tsdf), None, None))
     return volumes
 
 

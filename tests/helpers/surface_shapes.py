@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.depth_maps import RenderedView
+from gs2d.meshing.depth_maps import DepthMap, RenderedView
 from gs2d.meshing.fusion_bounds import FusionBounds
-from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
+from gs2d.meshing.marching_cubes import cell_surface, edge_vertices
+from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume, find_blocks, fuse_blocks
+
+
+def fuse(
+    maps: Sequence[DepthMap], lim: FusionBounds, *, threads: int = 1, backend: str = "auto", max_bytes: int = 4 << 30
+) -> Volume:
+    """Fuse depth maps into one volume."""
+    blocks = find_blocks(maps, lim, max_bytes=max_bytes, threads=threads)
+    return fuse_blocks(maps, lim, blocks, threads=threads, backend=backend)
+
+
+def marching_cubes(volume: Volume, min_weight: float = 1.0) -> Mesh:
+    """Extract the surface of a whole volume."""
+    edges, faces, ends = cell_surface(volume, min_weight)
+    vertices, colors = edge_vertices(volume, edges, ends)
+    return Mesh(vertices, faces.astype(np.int32), colors)
 
 
 def limits(half: float, voxel: float, truncation: float | None = None, depth_limit: float = 100.0) -> FusionBounds:
@@ -27,7 +43,7 @@ def volume_of(field: Callable[[np.ndarray], np.ndarray], lim: FusionBounds, bloc
     local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
     at = np.asarray(lim.lower) + (corner[:, None] + local) * lim.voxel  # [M, 512, 3]
     tsdf = field(at.reshape(-1, 3)).reshape(len(corner), VOXELS).astype(np.float32)
-    return Volume(lim, dims, np.arange(blocks**3), tsdf, np.ones_like(tsdf), None, None, 1)
+    return Volume(lim, dims, np.arange(blocks**3), tsdf, np.ones_like(tsdf), None, None)
 
 
 def dense(volume: Volume) -> np.ndarray:

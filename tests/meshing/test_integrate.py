@@ -16,12 +16,11 @@ from gs2d.meshing.sampling import make_sampler
 from gs2d.meshing.tsdf_volume import (
     Volume,
     block_grid,
-    fuse,
     fusion_backend,
     integrator,
     invalid_volume,
 )
-from surface_shapes import limits, orbit, sphere_depth
+from surface_shapes import fuse, limits, orbit, sphere_depth
 
 ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")
 LIMITS = limits(1.3, 0.05)
@@ -52,7 +51,7 @@ def test_the_field_depends_neither_on_threads_nor_on_the_instruction_set(
     variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames = views()
-    expected = fuse(frames, LIMITS, threads=1)
+    expected = fuse(frames, LIMITS)
     assert expected.color_weight is not None
     assert (expected.color_weight > 0).any()
     monkeypatch.setenv("GS2D_CPU_VARIANT", variant)
@@ -64,7 +63,7 @@ def wall(depth: float) -> tuple[Volume, DepthMap, Camera]:
     camera = Camera(64, 64, 16.0, 16.0, 32.0, 32.0, np.eye(4))
     lim = replace(LIMITS, lower=(-1.0, -1.0, 1.0), upper=(0.5, 0.5, 2.5), voxel=0.25, truncation=1.0, depth_limit=9.0)
     color = np.full((64, 64, 3), 200, np.uint8)
-    volume = invalid_volume(lim, block_grid(lim), np.zeros(1, np.int64), colored=True, frames=1)
+    volume = invalid_volume(lim, block_grid(lim), np.zeros(1, np.int64), colored=True)
     return volume, depth_map(RenderedView(camera, np.full((64, 64), depth), color)), camera
 
 

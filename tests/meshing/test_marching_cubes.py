@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.marching_cubes import (
-    components,
-    keep_components,
-    marching_cubes,
-)
+from gs2d.meshing.marching_cubes import components, keep_components
 from gs2d.meshing.tsdf_volume import BLOCK, Volume
-from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
+from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, marching_cubes, signed_volume, volume_of
 
 
 def sphere(radius: float) -> object:
@@ -95,13 +91,13 @@ def test_unknown_voxels_create_no_surface() -> None:
     valid = volume_of(sphere(0.7), lim, 4)
     weight = valid.weight.copy()
     weight[valid.blocks[:, 0] >= 2] = 0.5  # half of space is below the minimum weight
-    half = Volume(lim, valid.dims, valid.keys, valid.tsdf, weight, None, None, 1)
+    half = Volume(lim, valid.dims, valid.keys, valid.tsdf, weight, None, None)
     mesh = marching_cubes(half, min_weight=1.0)
     boundary = lim.lower[0] + 2 * BLOCK * lim.voxel
     assert len(mesh.faces) > 100
     assert mesh.vertices[:, 0].max() < boundary
     assert marching_cubes(half, min_weight=0.5).vertices[:, 0].max() == pytest.approx(0.7, abs=0.01)
-    nothing = Volume(lim, valid.dims, valid.keys, valid.tsdf, np.zeros_like(weight), None, None, 1)
+    nothing = Volume(lim, valid.dims, valid.keys, valid.tsdf, np.zeros_like(weight), None, None)
     assert len(marching_cubes(nothing, min_weight=0.0).faces) == 0
 
 
@@ -109,7 +105,7 @@ def test_missing_blocks_are_unknown_space() -> None:
     lim = limits(1.0, 2 / 32)
     full = volume_of(sphere(0.7), lim, 4)
     rows = np.flatnonzero(full.blocks[:, 2] != 1)
-    part = Volume(lim, full.dims, full.keys[rows], full.tsdf[rows], full.weight[rows], None, None, 1)
+    part = Volume(lim, full.dims, full.keys[rows], full.tsdf[rows], full.weight[rows], None, None)
     mesh = marching_cubes(part)
     low, high = lim.lower[2] + BLOCK * lim.voxel, lim.lower[2] + 2 * BLOCK * lim.voxel
     z = mesh.vertices[:, 2]
@@ -125,11 +121,11 @@ def test_vertex_colours_are_interpolated_without_uncoloured_ends() -> None:
     color[plain.tsdf < 0] = [10.0, 20.0, 30.0]
     weights = np.ones_like(plain.tsdf)
     # voxels lie at -1 + k/8: the plane z = 0.05 is 0.4 of the way from voxel 8 (below) to voxel 9 (above)
-    mixed = marching_cubes(Volume(lim, plain.dims, plain.keys, plain.tsdf, plain.weight, color, weights, 1))
+    mixed = marching_cubes(Volume(lim, plain.dims, plain.keys, plain.tsdf, plain.weight, color, weights))
     assert mixed.colors is not None
     assert (mixed.colors == [42, 48, 54]).all()  # 0.6 * 10 + 0.4 * 90 = 42
     weights[plain.tsdf > 0] = 0
-    below = marching_cubes(Volume(lim, plain.dims, plain.keys, plain.tsdf, plain.weight, color, weights, 1))
+    below = marching_cubes(Volume(lim, plain.dims, plain.keys, plain.tsdf, plain.weight, color, weights))
     assert below.colors is not None
     assert (below.colors == [10, 20, 30]).all()
 

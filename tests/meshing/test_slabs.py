@@ -7,10 +7,9 @@ import pytest
 
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
-from gs2d.meshing.marching_cubes import marching_cubes
 from gs2d.meshing.slabs import fused_surface, slabs
-from gs2d.meshing.tsdf_volume import block_bytes, find_blocks, fuse, fuse_blocks
-from surface_shapes import orbit, sphere_depth
+from gs2d.meshing.tsdf_volume import block_bytes, find_blocks, fuse_blocks
+from surface_shapes import fuse, marching_cubes, orbit, sphere_depth
 
 
 def maps(*, colored: bool) -> list[DepthMap]:
@@ -31,7 +30,7 @@ def test_the_mesh_does_not_depend_on_slabs(colored: bool, fraction: float) -> No
     blocks = find_blocks(seen, limits, threads=1)
     most = int(fraction * blocks.nbytes)
     assert len(list(slabs(blocks, most))) > 1
-    whole = marching_cubes(fuse(seen, limits, threads=1))
+    whole = marching_cubes(fuse(seen, limits))
     parts = fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)
     assert len(whole.faces) > 1000
     np.testing.assert_array_equal(parts.vertices, whole.vertices)

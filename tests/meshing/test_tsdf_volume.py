@@ -12,13 +12,15 @@ from gs2d.errors import ProtocolError
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool, depth_map
 from gs2d.meshing.extract import ExtractOptions, extract
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
-from gs2d.meshing.marching_cubes import components, marching_cubes
-from gs2d.meshing.tsdf_volume import FULL_WEIGHT_BEHIND, block_bytes, fuse
+from gs2d.meshing.marching_cubes import components
+from gs2d.meshing.tsdf_volume import FULL_WEIGHT_BEHIND, block_bytes
 from surface_shapes import (
     box_depth,
     edge_uses,
+    fuse,
     is_closed_manifold,
     limits,
+    marching_cubes,
     orbit,
     rays,
     signed_volume,
@@ -34,7 +36,7 @@ def maps(frames: list[RenderedView]) -> list[DepthMap]:
 
 
 def test_a_sphere_seen_from_all_round_is_closed_and_has_its_radius() -> None:
-    mesh = marching_cubes(fuse(maps(sphere_frames(orbit(30, 3.0))), LIMITS, threads=1))
+    mesh = marching_cubes(fuse(maps(sphere_frames(orbit(30, 3.0))), LIMITS))
     assert is_closed_manifold(mesh)
     assert components(mesh).max() == 0
     radius = np.linalg.norm(mesh.vertices, axis=1)
@@ -52,7 +54,7 @@ def test_an_oblique_plane_is_flat_to_a_small_part_of_a_voxel() -> None:
     slope = (np.arange(160) + 0.5 - 80) / 200
     depth = np.broadcast_to(4 / (1 - 0.8 * slope), (120, 160))
     lim = replace(limits(1.0, 0.02), lower=(-1.0, -0.8, 3.2), upper=(0.8, 0.8, 4.8))
-    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], lim, threads=1))
+    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], lim))
     error = (mesh.vertices[:, 2] - 4 - 0.8 * mesh.vertices[:, 0]) / np.hypot(1, 0.8)
     assert np.abs(error).max() < 0.02 * lim.voxel
 
@@ -65,7 +67,7 @@ def test_no_depth_is_invented_across_a_depth_edge() -> None:
     camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
     depth = np.where(np.arange(64) < 32, 2.0, 3.0) * np.ones((64, 1))
     lim = replace(limits(1.0, 0.02), lower=(-1.0, -0.5, 1.5), upper=(1.0, 0.5, 3.5))
-    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], lim, threads=1))
+    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], lim))
     z = mesh.vertices[:, 2]
     near = z < 2 + FULL_WEIGHT_BEHIND * lim.truncation + lim.voxel
     assert (np.abs(z[near & (np.abs(mesh.vertices[:, 0]) > 0.05)] - 2) < 0.01).all()
@@ -78,7 +80,7 @@ def test_unobserved_space_creates_no_shell() -> None:
     """One camera sees half a sphere: the mesh is one open sheet, with nothing behind it or around the image border."""
     camera = look_at(np.array([0, -3.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), width=160, height=160, fx=200)
     depth = sphere_depth(camera, 1.0)
-    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], limits(1.3, 0.02), threads=1))
+    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], limits(1.3, 0.02)))
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02
     assert mesh.vertices[:, 1].max() < -1 / 3 + 0.05  # the silhouette seen from distance 3 is at y = -1/3
     _, uses, _ = edge_uses(mesh)
@@ -93,7 +95,7 @@ def test_a_thin_plate_seen_from_both_sides_has_two_faces_and_no_other_layer(thic
     low, high = np.array([-0.6, -0.6, -half]), np.array([0.6, 0.6, half])
     cameras = orbit(36, 3.0, size=160, focal=220.0)
     frames = [RenderedView(camera, box_depth(camera, low, high)) for camera in cameras]
-    mesh = marching_cubes(fuse(maps(frames), limits(0.8, voxel), threads=1))
+    mesh = marching_cubes(fuse(maps(frames), limits(0.8, voxel)))
     inner = np.abs(mesh.vertices[:, :2]).max(1) < 0.5
     height = np.abs(mesh.vertices[inner, 2])
     assert np.abs(height - half).max() < 0.75 * voxel  # every vertex is on one of the two faces
@@ -116,7 +118,7 @@ def test_invalid_pixels_are_ignored() -> None:
     left = depth_map(RenderedView(camera, np.where(depth > 0, depth, np.nan), valid=valid))
     assert (left.depth[:, 48:] == 0).all()
     assert np.isfinite(left.depth).all()
-    mesh = marching_cubes(fuse([left], LIMITS, threads=1))
+    mesh = marching_cubes(fuse([left], LIMITS))
     x, _ = camera.project(mesh.vertices)
     assert x[:, 0].max() < 48.5
 
@@ -127,7 +129,7 @@ def test_pixel_weights_are_used() -> None:
     one = np.ones((64, 64))
     frames = [RenderedView(camera, 2.00 * one, valid=3 * one), RenderedView(camera, 2.04 * one, valid=1 * one)]
     lim = replace(limits(1.0, 0.02), lower=(-0.5, -0.5, 1.5), upper=(0.5, 0.5, 2.5), truncation=0.2)
-    mesh = marching_cubes(fuse(maps(frames), lim, threads=1))
+    mesh = marching_cubes(fuse(maps(frames), lim))
     np.testing.assert_allclose(mesh.vertices[:, 2], 2.01, atol=1e-4)
 
 
@@ -138,7 +140,7 @@ def test_free_space_clears_a_phantom_that_other_views_look_through() -> None:
     phantom[28:36, 28:36] = 1.95  # 0.15 in front of the surface
     for position in (0, 30):  # at any position in the order
         order = [*frames[1 : 1 + position], RenderedView(cameras[0], phantom), *frames[1 + position :]]
-        mesh = marching_cubes(fuse(maps(order), LIMITS, threads=1))
+        mesh = marching_cubes(fuse(maps(order), LIMITS))
         assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.92
 
 
@@ -151,7 +153,7 @@ def test_colours_come_from_the_views_that_see_the_surface() -> None:
         point = o + depth[..., None] * d
         color = np.where(point[..., 2:] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])  # red above, blue below
         frames.append(RenderedView(camera, depth, color, depth > 0))
-    mesh = marching_cubes(fuse(maps(frames), LIMITS, threads=1))
+    mesh = marching_cubes(fuse(maps(frames), LIMITS))
     assert mesh.colors is not None
     top, bottom = mesh.vertices[:, 2] > 0.1, mesh.vertices[:, 2] < -0.1
     assert mesh.colors[top, 0].min() > 230
@@ -161,7 +163,7 @@ def test_colours_come_from_the_views_that_see_the_surface() -> None:
 
 def test_the_result_does_not_depend_on_threads() -> None:
     frames = maps(sphere_frames(orbit(6, 3.0)))
-    one, three = fuse(frames, LIMITS, threads=1), fuse(frames, LIMITS, threads=3)
+    one, three = fuse(frames, LIMITS), fuse(frames, LIMITS, threads=3)
     np.testing.assert_array_equal(one.tsdf, three.tsdf)
     np.testing.assert_array_equal(one.weight, three.weight)
 
@@ -174,7 +176,7 @@ def test_memory_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
         fuse(frames, lim, max_bytes=max_bytes)
     assert "\n" not in str(error.value)
     voxel = float(str(error.value).split("voxel of about ")[1].split(" ")[0])
-    volume = fuse(frames, limits(1.3, voxel), max_bytes=max_bytes, threads=1)
+    volume = fuse(frames, limits(1.3, voxel), max_bytes=max_bytes)
     assert 0.3 * max_bytes < volume.nbytes <= max_bytes
 
 

@@ -51,7 +51,7 @@ class ExtractOptions:
     voxel, truncation, depth_limit : float world units or None
         The derived truncation grows with the disagreement of the depth maps (``consistency.depth_noise``).
     min_weight : float
-        See ``marching_cubes``.
+        See ``cell_surface``.
     keep : int or None
         Number of components to keep, see ``keep_components``.
     by_evidence : bool
@@ -102,7 +102,7 @@ def extract(
     options : ExtractOptions
     threads : int, optional
     backend : str or Backend
-        Backend of the fusion, see ``fuse``.
+        Backend of the fusion, see ``fuse_blocks``.
 
     Raises
     ------

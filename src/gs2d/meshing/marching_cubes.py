@@ -122,8 +122,10 @@ EDGES_OF_BLOCK = 3 * VOXELS  # edges that start at its voxels
 _EDGE_GUARD = np.float32(1e-3)  # of an edge: distance of vertices from its ends, against degenerate triangles
 
 
-def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
-    """Extract the zero level set of a volume.
+def cell_surface(
+    volume: Volume, min_weight: float, blocks: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the topology of the zero level set of a volume.
 
     Parameters
     ----------
@@ -131,27 +133,6 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
     min_weight : float
         Voxels with a lower weight are unknown. A view adds 1 to voxels in front of its surface, and to those behind it
         up to ``FULL_WEIGHT_BEHIND`` of the truncation.
-
-    Returns
-    -------
-    Mesh
-        float32 vertices in the world, faces counter-clockwise seen from the cameras' side, colours if the volume has
-        them.
-    """
-    edges, faces, ends = cell_surface(volume, min_weight)
-    vertices, colors = edge_vertices(volume, edges, ends)
-    return Mesh(vertices, faces.astype(np.int32), colors)
-
-
-def cell_surface(
-    volume: Volume, min_weight: float, blocks: int | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the topology of the surface of a volume.
-
-    Parameters
-    ----------
-    volume : Volume
-    min_weight : float
     blocks : int, optional
         Process the first ``blocks`` blocks only (default: all).
 
@@ -160,7 +141,7 @@ def cell_surface(
     edges : ndarray [P] int64
         Sorted grid edges with a vertex: 3 * (512 * row + voxel) + axis, of the voxel at the lower end.
     faces : ndarray [F, 3]
-        Indices into ``edges``.
+        Indices into ``edges``, counter-clockwise seen from the cameras' side.
     ends : ndarray [P] int64
         Voxel at the upper end of each edge, as 512 * row + voxel; larger than that of the lower end.
     """

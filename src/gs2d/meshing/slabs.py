@@ -31,7 +31,7 @@ def fused_surface(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Mesh:
-    """Return the mesh of ``marching_cubes(fuse(...))`` without the whole volume in memory.
+    """Fuse depth maps and extract their surface, without the whole volume in memory.
 
     Parameters
     ----------
@@ -41,11 +41,11 @@ def fused_surface(
     blocks : VolumeBlocks
         From ``find_blocks``.
     min_weight : float
-        See ``marching_cubes``.
+        See ``cell_surface``.
     slab_bytes : int
         Limit for a slab; exceeded only if a single layer of blocks and the next one do not fit.
     threads, backend
-        As for ``fuse``.
+        As for ``fuse_blocks``.
     """
     edges: list[np.ndarray] = []
     vertices: list[np.ndarray] = []

@@ -48,8 +48,6 @@ class Volume:
         0 means unknown.
     color, color_weight : ndarray [M, 512, 3] and [M, 512] float32, or None
         0 to 255, from views with a surface near the voxel.
-    frames : int
-        Number of fused depth maps.
     """
 
     limits: FusionBounds
@@ -59,7 +57,6 @@ class Volume:
     weight: np.ndarray
     color: np.ndarray | None
     color_weight: np.ndarray | None
-    frames: int
 
     @property
     def blocks(self) -> np.ndarray:
@@ -78,9 +75,7 @@ def block_bytes(colored: bool) -> int:
     return 8 + VOXELS * 4 * (6 if colored else 2)
 
 
-def invalid_volume(
-    limits: FusionBounds, dims: tuple[int, int, int], keys: np.ndarray, *, colored: bool, frames: int
-) -> Volume:
+def invalid_volume(limits: FusionBounds, dims: tuple[int, int, int], keys: np.ndarray, *, colored: bool) -> Volume:
     """Allocate blocks with unknown voxels."""
     m = len(keys)
     return Volume(
@@ -91,7 +86,6 @@ def invalid_volume(
         weight=np.zeros((m, VOXELS), np.float32),
         color=np.zeros((m, VOXELS, 3), np.float32) if colored else None,
         color_weight=np.zeros((m, VOXELS), np.float32) if colored else None,
-        frames=frames,
     )
 
 
@@ -202,58 +196,40 @@ def native_library(threads: int | None) -> Library:
     return library
 
 
-@dataclass(frozen=True, eq=False)
 class _Grid:
-    """Positions of the blocks of a volume."""
+    """The blocks of a volume."""
 
-    volume: Volume
-    origins: np.ndarray  # [M, 3] world units, of each block's first voxel
-    local: np.ndarray  # [512, 3] world units, of a voxel from there
+    def __init__(self, volume: Volume) -> None:
+        self.volume, voxel = volume, volume.limits.voxel
+        self._origins = np.asarray(volume.limits.lower) + volume.blocks * (BLOCK * voxel)  # [M, 3] of first voxels
+        self._local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1) * voxel  # [512, 3] from there
 
+    def change(self, view: DepthSampler) -> dict[str, np.ndarray | None]:
+        """Project the blocks that a view may change into it, by kernel argument.
 
-@dataclass(frozen=True, eq=False)
-class _Change:
-    """The blocks that a view may change, projected into it."""
-
-    rows: np.ndarray  # [n] int64
-    bases: np.ndarray  # [n, 3] float32 (x z, y z, z) of each block's first voxel
-    offsets: np.ndarray  # [3, 512] float32, of a voxel from there
-
-
-def _grids(volumes: Sequence[Volume]) -> list[_Grid]:
-    found = []
-    for volume in volumes:
-        voxel = volume.limits.voxel
-        origins = np.asarray(volume.limits.lower) + volume.blocks * (BLOCK * voxel)
-        local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1) * voxel
-        if len(volume.keys):
-            found.append(_Grid(volume, origins, local))
-    return found
-
-
-def _change(grid: _Grid, view: DepthSampler) -> _Change:
-    limits = grid.volume.limits
-    size = BLOCK * limits.voxel
-    radius = 0.5 * np.sqrt(3.0) * size
-    rows = block_visibility(view, grid.origins + 0.5 * (size - limits.voxel), radius, limits.truncation)
-    rotation, shift = view.projection[:, :3].T, view.projection[:, 3]
-    offsets = np.ascontiguousarray((grid.local @ rotation).T, dtype=np.float32)
-    bases = (grid.origins[rows] @ rotation + shift).astype(np.float32)
-    return _Change(rows, bases, offsets)
+        ``rows`` [n] int64 are these blocks, ``bases`` [n, 3] float32 (x z, y z, z) of their first voxels, ``offsets``
+        [3, 512] float32 of a voxel from there.
+        """
+        limits = self.volume.limits
+        size = BLOCK * limits.voxel
+        radius = 0.5 * np.sqrt(3.0) * size
+        rows = block_visibility(view, self._origins + 0.5 * (size - limits.voxel), radius, limits.truncation)
+        rotation, shift = view.projection[:, :3].T, view.projection[:, 3]
+        offsets = np.ascontiguousarray((self._local @ rotation).T, dtype=np.float32)
+        bases = (self._origins[rows] @ rotation + shift).astype(np.float32)
+        return {"rows": rows, "bases": bases, "offsets": offsets}
 
 
 @contextmanager
 def add_natively(volumes: Sequence[Volume], threads: int | None) -> Iterator[Add]:
     """Add views with the native CPU library."""
-    grids = _grids(volumes)
+    grids = [_Grid(volume) for volume in volumes if len(volume.keys)]
 
     def add(view: DepthSampler) -> None:
         library = native_library(threads)
         for grid in grids:
-            volume, change = grid.volume, _change(grid, view)
-            arrays = _view_arrays(view, colored=volume.color is not None)
-            arrays |= {"rows": change.rows, "bases": change.bases, "offsets": change.offsets}
-            arrays |= _volume_arrays(volume)
+            volume = grid.volume
+            arrays = _view_arrays(view, colored=volume.color is not None) | grid.change(view) | _volume_arrays(volume)
             fuse_on_cpu(library, arguments_of((view.height, view.width), volume.limits.truncation, arrays))
 
     yield add
@@ -266,15 +242,14 @@ def add_on_gpu(volumes: Sequence[Volume], gpu: FusionOnDevice) -> Iterator[Add]:
     def to_device(arrays: dict[str, np.ndarray | None]) -> dict[str, torch.Tensor | None]:
         return {name: None if a is None else torch.from_numpy(a).to(gpu.device) for name, a in arrays.items()}
 
-    grids = _grids(volumes)
+    grids = [_Grid(volume) for volume in volumes if len(volume.keys)]
     held = [to_device(_volume_arrays(grid.volume)) for grid in grids]
 
     def add(view: DepthSampler) -> None:
         colored = any(grid.volume.color is not None for grid in grids)
         image = to_device(_view_arrays(view, colored=colored))
         for grid, volume in zip(grids, held, strict=True):
-            change = _change(grid, view)
-            blocks = to_device({"rows": change.rows, "bases": change.bases, "offsets": change.offsets})
+            blocks = to_device(grid.change(view))
             size, truncation = (view.height, view.width), grid.volume.limits.truncation
             fuse_on_gpu(gpu.launcher, arguments_of(size, truncation, image | blocks | volume))
 
@@ -300,40 +275,6 @@ def _volume_arrays(volume: Volume) -> dict[str, np.ndarray | None]:
 # -- all views ---------------------------------------------------------------------------------------------------------
 
 
-def fuse(
-    frames: Iterable[DepthMap],
-    limits: FusionBounds,
-    *,
-    max_bytes: int = 4 << 30,
-    threads: int | None = None,
-    backend: str | Backend = "auto",
-) -> Volume:
-    """Fuse depth maps.
-
-    Parameters
-    ----------
-    frames : iterable of DepthMap
-        Read twice, one at a time: a sequence or a ``Spool``, not a generator.
-    limits : FusionBounds
-    max_bytes : int
-        Limit of the volume.
-    threads : int, optional
-        Default: all cores. The result does not depend on it.
-    backend : str or Backend
-        "cuda", or the native CPU library: "cpu" and every other name.
-
-    Raises
-    ------
-    ProtocolError
-        If the blocks near the surface need more than ``max_bytes`` (the message suggests a voxel), the truncation
-        exceeds the box, or no depth is inside the limits.
-    BackendError
-        If the backend is unknown or cannot run here.
-    """
-    blocks = find_blocks(frames, limits, max_bytes=max_bytes, threads=threads)
-    return fuse_blocks(frames, limits, blocks, threads=threads, backend=backend)
-
-
 @dataclass(frozen=True, eq=False)
 class VolumeBlocks:
     """The blocks near the surfaces of depth maps.
@@ -344,14 +285,11 @@ class VolumeBlocks:
         As in ``Volume``.
     colored : bool
         Whether a depth map has colour.
-    frames : int
-        Number of depth maps.
     """
 
     dims: tuple[int, int, int]
     keys: np.ndarray
     colored: bool
-    frames: int
 
     @property
     def nbytes(self) -> int:
@@ -370,22 +308,39 @@ def find_blocks(
     max_bytes: int = 4 << 30,
     threads: int | None = None,
 ) -> VolumeBlocks:
-    """Find the blocks to fuse; parameters and errors as for ``fuse``."""
+    """Find the blocks to fuse.
+
+    Parameters
+    ----------
+    frames : iterable of DepthMap
+        Read one at a time: a sequence or a ``Spool``, not a generator.
+    limits : FusionBounds
+    max_bytes : int
+        Limit of the volume.
+    threads : int, optional
+        Default: all cores. The result does not depend on it.
+
+    Raises
+    ------
+    ProtocolError
+        If the blocks near the surface need more than ``max_bytes`` (the message suggests a voxel), the truncation
+        exceeds the box, or no depth is inside the limits.
+    """
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(limits)
     dims = block_grid(limits)
     budget = Budget(limits, max_bytes)
     keys = np.zeros(0, dtype=np.int64)
-    colored, count = False, 0
+    colored = False
     for item in frames:
-        colored, count = colored or item.color is not None, count + 1
+        colored = colored or item.color is not None
         keys = merged(keys, touched_blocks(item, limits, dims, threads))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
         raise ProtocolError("no depth is inside the limits of the fusion; increase bbox or depth_limit")
-    return VolumeBlocks(dims, keys, colored, count)
+    return VolumeBlocks(dims, keys, colored)
 
 
 def fuse_blocks(
@@ -396,8 +351,8 @@ def fuse_blocks(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Volume:
-    """Fuse depth maps into these blocks; parameters as for ``fuse``."""
-    volume = invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
+    """Fuse depth maps into these blocks; ``backend`` is "cuda", or the native CPU library for every other name."""
+    volume = invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored)
     add_all([volume], frames, lambda item: make_sampler(item, limits), threads=threads, backend=backend)
     return volume
 

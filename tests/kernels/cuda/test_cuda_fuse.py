@@ -26,7 +26,7 @@ def test_the_kernel_leaves_the_field_of_the_cpu_in_every_bit(emulator: emulate.E
     assert 4 < len(keys) < 500
 
     def empty() -> Volume:
-        return invalid_volume(limits, dims, keys, colored=colored, frames=4)
+        return invalid_volume(limits, dims, keys, colored=colored)
 
     found, expected = empty(), empty()
     gpu = FusionOnDevice(emulator, torch.device("cpu"))

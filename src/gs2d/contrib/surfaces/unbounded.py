@@ -216,27 +216,27 @@ def find_cascade_blocks(
     max_bytes: int = 4 << 30,
     threads: int | None = None,
 ) -> tuple[VolumeBlocks, ...]:
-    """Find the blocks of each level; parameters and errors as for ``fuse``, with a common limit of memory."""
+    """Find the blocks of each level; parameters and errors as for ``find_blocks``, with a common limit of memory."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(cascade.levels[0])
     block_grid(cascade.levels[0])  # refuses voxels that are too small
     budget = Budget(cascade.levels[0], max_bytes, side=2 * cascade.half, step=STEP)
     keys = [np.zeros(0, dtype=np.int64) for _ in cascade.levels]
-    colored, count = False, 0
+    colored = False
     for item in frames:
-        colored, count = colored or item.color is not None, count + 1
+        colored = colored or item.color is not None
         for k, found in enumerate(_touched(item, cascade, threads)):
             keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
     if not any(map(len, keys)):
         raise ProtocolError("no depth is inside the limits of the fusion; increase bbox or depth_limit")
-    return tuple(VolumeBlocks(cascade.dims, found, colored, count) for found in keys)
+    return tuple(VolumeBlocks(cascade.dims, found, colored) for found in keys)
 
 
 def _empty(blocks: VolumeBlocks, limits: FusionBounds) -> Volume:
-    return invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
+    return invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored)
 
 
 def _fuse_into(
@@ -372,7 +372,7 @@ def fused_cascade_surface(
     slab_bytes : int
         See ``fused_surface``.
     threads, backend
-        As for ``fuse``.
+        As for ``fuse_blocks``.
     """
     surface = CascadeSurface(cascade, [len(part.keys) for part in blocks], min_weight, far_weight)
     for level, part in enumerate(blocks):
