@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.kernel_usage import usage_of
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.compile import compile_source, nvrtc_version, source_names
 
@@ -111,7 +112,7 @@ def count() -> dict[str, dict[str, Any]]:
             words = [tool, "-c", file.name]
             listing = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60).stdout
         loops = innermost_loops(listing)
-        for kernel, usage in compiled.usage().items():
+        for kernel, usage in usage_of(compiled).items():
             kernels[kernel] = {
                 "registers": usage.registers,
                 "shared_bytes": usage.shared_bytes,

@@ -159,9 +159,9 @@ class RecordingLauncher(OneByOne):
     inner: Launcher
     names: set[str] = field(default_factory=set)
 
-    def launch(self, name: str, blocks: int, threads: int, arguments: Any, shared_bytes: int = 0) -> None:
+    def launch(self, name: str, blocks: int, threads: int, arguments: Any) -> None:
         self.names.add(name)
-        self.inner.launch(name, blocks, threads, arguments, shared_bytes)
+        self.inner.launch(name, blocks, threads, arguments)
 
 
 @dataclass(eq=False)
@@ -172,9 +172,9 @@ class TimingLauncher(OneByOne):
     dry: bool
     spans: dict[str, list[Callable[[], float]]] = field(default_factory=dict)
 
-    def launch(self, name: str, blocks: int, threads: int, arguments: Any, shared_bytes: int = 0) -> None:
+    def launch(self, name: str, blocks: int, threads: int, arguments: Any) -> None:
         clock = _Clock(self.dry)
-        self.inner.launch(name, blocks, threads, arguments, shared_bytes)
+        self.inner.launch(name, blocks, threads, arguments)
         self.spans.setdefault(name, []).append(clock.stop())
 
     def medians(self, skip: int) -> dict[str, float]:

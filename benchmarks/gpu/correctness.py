@@ -20,6 +20,7 @@ from torch import Tensor
 from benchmarks.gpu import whole
 from benchmarks.gpu.bench import ROOT, Bench, run_program
 from benchmarks.gpu.probes import ceilings
+from benchmarks.kernel_usage import usage_of
 from gs2d.config.recipe import Stage
 from gs2d.core.splats import Splats
 from gs2d.kernels.cuda import cuda_losses as ops
@@ -61,7 +62,7 @@ def registers(bench: Bench) -> dict[str, Any]:
     """Return registers, spills and shared memory of each kernel for this device."""
     arch = ARCHITECTURES[4] if bench.dry else str(bench.launcher.architecture)  # type: ignore[attr-defined]
     names = source_names()[:1] if bench.dry else source_names()
-    used = {kernel: usage for name in names for kernel, usage in compile_source(name, arch).usage().items()}
+    used = {kernel: usage for name in names for kernel, usage in usage_of(compile_source(name, arch)).items()}
     return {"architecture": arch, **{kernel: vars(usage) for kernel, usage in used.items()}}
 
 

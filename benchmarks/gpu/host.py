@@ -23,6 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.gpu.bench import EmulatedBackend
 from benchmarks.gpu.sass import listing
 from benchmarks.iteration import steady
+from benchmarks.kernel_usage import usage_of
 from benchmarks.workload import PLACES, camera, room
 from gs2d.config.presets import best, two_dgs_r
 from gs2d.config.protocols import GENERIC
@@ -231,7 +232,7 @@ def machine_code(arch: str = "sm_90") -> dict[str, Any]:
             "accesses": kernels[name][kernel].accesses(),
         }
         for name, made in code.items()
-        for kernel, usage in sorted(made.usage().items())
+        for kernel, usage in sorted(usage_of(made).items())
         if not kernel.endswith(("_32", "_abs", "distortion", "transmittance")) or kernel.endswith("pass_32")
     }
 

@@ -90,6 +90,7 @@ def listing(code: bytes) -> dict[str, Listing]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a row per kernel."""
+    from benchmarks.kernel_usage import usage_of
     from gs2d.kernels.cuda.compile import compile_source, source_names
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -100,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for source in source_names():
         compiled = compile_source(source, args.arch)
         kernels = listing(compiled.code)
-        for name, usage in sorted(compiled.usage().items()):
+        for name, usage in sorted(usage_of(compiled).items()):
             if not args.names or any(word in name for word in args.names):
                 made = kernels[name]
                 row = f"{usage.registers}, {usage.shared_bytes}, {len(made.instructions)}, {made.accesses()}"

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from benchmarks.gpu import __main__ as command
+from benchmarks.kernel_usage import usage_of
 
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import KERNEL, compile_text
@@ -67,7 +68,7 @@ def test_the_probes_compile_for_the_newest_and_the_oldest_architecture() -> None
     pytest.importorskip("cuda.bindings", reason="cuda-bindings is not here")
     text = (ROOT / "benchmarks" / "gpu" / "probes.cu").read_text()
     for arch in ("sm_75", "sm_120"):
-        usage = compile_text(text, "probes.cu", arch).usage()
+        usage = usage_of(compile_text(text, "probes.cu", arch))
         assert set(usage) == set(KERNEL.findall(text)) == {"probe_fma", "probe_shuffle", "probe_exp2", "probe_red"}
         assert all(used.spilled_bytes == 0 for used in usage.values())
 

@@ -158,8 +158,7 @@ class Emulator(OneByOne):
     undefined: bool = False
     _built: dict[str, EmulatedKernels] = field(default_factory=dict)
 
-    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
-        assert shared_bytes == 0, "the emulator has no dynamic shared memory"
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
         if blocks == 0:
             return
         if name not in self._built:

@@ -28,10 +28,6 @@ class Result(IntEnum):
 ARGUMENT_BYTES = 1024  # larger than any argument structure
 
 
-class Attribute(IntEnum):
-    CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES = 8
-
-
 @dataclass(frozen=True)
 class Launch:
     """One launch as received by the driver."""
@@ -81,7 +77,6 @@ class FakeDriver:
     current: list[int] = field(default_factory=lambda: [0])  # context stack of the calling thread
     loaded: list[bytes] = field(default_factory=list)
     launches: list[Launch] = field(default_factory=list)
-    attributes: list[tuple[int, int, int, int]] = field(default_factory=list)
     names: list[str] = field(default_factory=list)  # index: handle - 1
     version: int = 12080
     graphs: list[list[Node]] = field(default_factory=list)  # index: handle - 1
@@ -89,7 +84,6 @@ class FakeDriver:
     changes: int = 0  # number of node updates
 
     CUresult = Result
-    CUfunction_attribute = Attribute
     CUstream = CUfunction = CUkernel = staticmethod(int)
     CUDA_KERNEL_NODE_PARAMS = NodeParameters
 
@@ -127,10 +121,6 @@ class FakeDriver:
         assert 0 < library <= len(self.loaded)
         self.names.append(name.decode())
         return self._done("cuLibraryGetKernel", len(self.names))
-
-    def cuKernelSetAttribute(self, attribute: int, value: int, kernel: int, device: int) -> tuple[Any, ...]:
-        self.attributes.append((attribute, value, kernel, device))
-        return self._done("cuKernelSetAttribute")
 
     def cuLaunchKernel(self, function: int, *rest: int) -> tuple[Any, ...]:
         gx, gy, gz, bx, by, bz, shared, stream, parameters, extra = rest

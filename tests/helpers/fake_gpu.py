@@ -166,9 +166,9 @@ def install(guard: str, emulator: Emulator) -> Counter[str]:
 
     launched: Counter[str] = Counter()
 
-    def run_kernel(name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+    def run_kernel(name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
         launched[name] += 1
-        emulator.launch(name, blocks, threads, arguments, shared_bytes)
+        emulator.launch(name, blocks, threads, arguments)
 
     def run_all(works: Any) -> None:
         for work in works:

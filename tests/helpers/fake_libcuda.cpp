@@ -51,12 +51,6 @@ int cuLibraryGetKernel(void** kernel, void* from, const char* name) {
     return *kernel = found, fails("cuLibraryGetKernel");
 }
 
-int cuKernelSetAttribute(int attribute, int value, void* kernel, int device) {
-    say("{\"call\": \"attribute\", \"attribute\": " + std::to_string(attribute) + ", \"value\": " + std::to_string(value) +
-        ", \"kernel\": \"" + static_cast<char*>(kernel) + "\", \"device\": " + std::to_string(device) + "}");
-    return fails("cuKernelSetAttribute");
-}
-
 int cuLaunchKernel(void* f, unsigned gx, unsigned gy, unsigned gz, unsigned bx, unsigned by, unsigned bz, unsigned shared,
                    void* stream, void** parameters, void** extra) {
     if (!current) return 201;  // CUDA_ERROR_INVALID_CONTEXT
@@ -124,7 +118,6 @@ int cuGetProcAddress_v2(const char* name, void** out, int, uint64_t, void* statu
     NAME(cuCtxPopCurrent, cuCtxPopCurrent_v2);
     NAME(cuLibraryLoadData, cuLibraryLoadData);
     NAME(cuLibraryGetKernel, cuLibraryGetKernel);
-    NAME(cuKernelSetAttribute, cuKernelSetAttribute);
     NAME(cuLaunchKernel, cuLaunchKernel);
     NAME(cuGraphCreate, cuGraphCreate);
     NAME(cuGraphAddKernelNode, cuGraphAddKernelNode_v2);

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from benchmarks.kernel_usage import usage_of
 
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc_compile
@@ -34,7 +35,7 @@ MEASURED = "sm_90"  # the architecture of the GPU used for measurements
 )
 def test_every_kernel_compiles_without_spills_or_stack(name: str, arch: str) -> None:
     compiled = compile_source(name, arch)
-    usage = compiled.usage()
+    usage = usage_of(compiled)
     assert usage
     assert compiled.code.startswith(b"\x7fELF")
     assert "warning" not in compiled.log
@@ -46,7 +47,7 @@ def test_every_kernel_compiles_without_spills_or_stack(name: str, arch: str) -> 
 @needs_nvrtc
 def test_the_spill_gate_sees_spills(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nvrtc_compile, "sources", lambda: {"cuda/greedy.cu": GREEDY})
-    usage = compile_source("cuda/greedy.cu", "sm_90").usage()["greedy"]
+    usage = usage_of(compile_source("cuda/greedy.cu", "sm_90"))["greedy"]
     assert usage.spilled_bytes > 0
     assert usage.stack_bytes > 0
     assert usage.registers <= 32

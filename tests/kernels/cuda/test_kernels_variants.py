@@ -32,9 +32,9 @@ class Recording:
     def __init__(self, emulator: Emulator) -> None:
         self.emulator, self.names = emulator, list[str]()
 
-    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
         self.names.append(name)
-        self.emulator.launch(name, blocks, threads, arguments, shared_bytes)
+        self.emulator.launch(name, blocks, threads, arguments)
 
 
 def gradients(
@@ -216,8 +216,8 @@ def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulat
 class FewBlocks(Recording):
     """Runs only the first blocks of the blend kernels, which have the longest lists."""
 
-    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
-        super().launch(name, min(blocks, 3) if name.startswith("blend") else blocks, threads, arguments, shared_bytes)
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
+        super().launch(name, min(blocks, 3) if name.startswith("blend") else blocks, threads, arguments)
 
 
 def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None:

@@ -56,15 +56,6 @@ def test_each_launch_uses_the_current_stream() -> None:
     assert [done.stream for done in driver.launches] == [1, 2, 3]
 
 
-def test_dynamic_shared_memory_beyond_48_kib_is_requested_once() -> None:
-    driver = FakeDriver()
-    launcher = fake_driver.launcher(driver, index=1)
-    for size in (48 << 10, 60_000, 60_000, 50_000, 70_000):
-        launcher.launch("project_splats", 1, 128, numbers(), size)
-    assert driver.attributes == [(8, 60_000, 1, 1), (8, 70_000, 1, 1)]  # attribute, bytes, kernel, device
-    assert [done.shared for done in driver.launches] == [49152, 60_000, 60_000, 50_000, 70_000]
-
-
 @pytest.mark.parametrize(
     ("function", "result", "words"),
     [
@@ -127,7 +118,7 @@ def make_launcher():
 def single():
     launcher = make_launcher()
     launcher.launch("project_splats", 5, 128, Numbers(77, 0.5))
-    launcher.launch("project_splats", 6, 128, Numbers(78, 0.5), 60000)
+    launcher.launch("project_splats", 6, 128, Numbers(78, 0.5))
 
 def repeated():
     launcher = make_launcher()
@@ -173,8 +164,7 @@ def test_the_real_bindings_pass_on_every_launch(calls: Calls) -> None:
     launched = {"call": "launch", "kernel": "project_splats", "block": [128, 1, 1], "stream": 0x1234, "device": 1}
     assert [call for call in calls["single"] if call["call"] != "load"] == [
         {**launched, "grid": [5, 1, 1], "shared": 0, "first": 77},
-        {"call": "attribute", "attribute": 8, "value": 60000, "kernel": "project_splats", "device": 1},
-        {**launched, "grid": [6, 1, 1], "shared": 60000, "first": 78},
+        {**launched, "grid": [6, 1, 1], "shared": 0, "first": 78},
     ]
 
 

@@ -25,7 +25,6 @@ from gs2d.kernels.cuda.driver import one_line
 __all__ = [
     "ARCHITECTURES",
     "Cubin",
-    "KernelUsage",
     "architecture_for",
     "cache_folder",
     "compile_source",
@@ -51,52 +50,11 @@ KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )
 
 
 @dataclass(frozen=True)
-class KernelUsage:
-    """Resources of one kernel, as reported by ptxas.
-
-    Attributes
-    ----------
-    registers : int
-        Per thread.
-    spilled_bytes, stack_bytes : int
-        Local memory per thread, spill stores and loads together; 0 in a good kernel.
-    shared_bytes : int
-        Per block.
-    """
-
-    registers: int
-    spilled_bytes: int
-    stack_bytes: int
-    shared_bytes: int
-
-
-@dataclass(frozen=True)
 class Cubin:
     """Machine code for one architecture (PTX for ``compute_XX``), and the compiler's log ("" if it was cached)."""
 
     code: bytes
     log: str
-
-    def usage(self) -> dict[str, KernelUsage]:
-        """Return the resources of each kernel, from the log."""
-        found: dict[str, KernelUsage] = {}
-        for part in self.log.split("Compiling entry function '")[1:]:
-            found[part.partition("'")[0]] = KernelUsage(
-                registers=_number(r"Used (\d+) registers", part),
-                spilled_bytes=_number(r"(\d+) bytes spill stores", part) + _number(r"(\d+) bytes spill loads", part),
-                stack_bytes=_number(r"(\d+) bytes stack frame", part),
-                shared_bytes=_number(r"(\d+) bytes smem", part, missing=0),
-            )
-        return found
-
-
-def _number(pattern: str, text: str, missing: int | None = None) -> int:
-    match = re.search(pattern, text)
-    if match is None:
-        if missing is not None:
-            return missing
-        raise BackendError(f"the CUDA compiler's log has no {pattern!r}: expected the format of CUDA 12 or 13")
-    return int(match.group(1))
 
 
 def sources() -> dict[str, str]:

@@ -26,7 +26,6 @@ __all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "laun
 
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
 STEP_VARIABLE, GRAPH, LAUNCHES = "GS2D_CUDA_STEP", "graph", "launches"
-STATIC_SHARED_BYTES = 48 << 10  # limit per block without an attribute
 GRAPHS_FROM = 3  # repetitions from which a graph pays off
 MAX_GRAPHS = 64
 MAX_STREAMS = 64  # cached stream objects
@@ -36,10 +35,10 @@ MAX_BLOCKS = (1 << 31) - 1
 class Launcher(Protocol):
     """Runs kernels; the tensors behind the structure's pointers must outlive the call.
 
-    ``shared_bytes`` is dynamic shared memory. A launch of 0 blocks does nothing.
+    A launch of 0 blocks does nothing.
     """
 
-    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
         """Queue the kernel ``name`` on the current stream."""
 
     def run(self, works: Sequence[Work]) -> None:
@@ -109,12 +108,11 @@ class GpuLauncher:
         self._source_of = nvrtc.kernel_sources() if source_of is None else source_of
         self._libraries: dict[str, tuple[Any, bytes]] = {}  # by source; the code must outlive its library
         self._functions: dict[str, Any] = {}  # by kernel
-        self._allowed: dict[str, int] = {}  # largest dynamic shared memory so far, by kernel
         self._lock = threading.Lock()  # the backward pass runs in another thread
         self._replays = True
         self._graphs: dict[tuple[str, ...], Graph | int] = {}  # by kernel names; an int counts repetitions
 
-    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
         """Start a kernel on the current stream without waiting.
 
         Raises
@@ -128,7 +126,7 @@ class GpuLauncher:
         if blocks > MAX_BLOCKS:
             raise BackendError(f"{name} needs {blocks} blocks, expected at most 2^31 - 1; use fewer splats or pixels")
         driver = self._driver
-        given = (name, blocks, threads, ctypes.c_void_p(ctypes.addressof(arguments)), shared_bytes)
+        given = (name, blocks, threads, ctypes.c_void_p(ctypes.addressof(arguments)))
         if int(call(driver, "cuCtxGetCurrent")) == self._context_number:  # nearly always
             status = self._start(*given)
         else:
@@ -187,13 +185,11 @@ class GpuLauncher:
             return None
         return known
 
-    def _start(self, name: str, blocks: int, threads: int, argument: ctypes.c_void_p, shared_bytes: int) -> Any:
+    def _start(self, name: str, blocks: int, threads: int, argument: ctypes.c_void_p) -> Any:
         """Launch in the current context; the driver copies the arguments."""
         function = self._functions.get(name) or self._load(name)
-        if shared_bytes > STATIC_SHARED_BYTES and shared_bytes > self._allowed.get(name, 0):
-            self._allow(name, shared_bytes)
         stream, at = self._stream(self._stream_of(self.device)), ctypes.addressof(argument)
-        return self._driver.cuLaunchKernel(function, blocks, 1, 1, threads, 1, 1, shared_bytes, stream, at, 0)[0]
+        return self._driver.cuLaunchKernel(function, blocks, 1, 1, threads, 1, 1, 0, stream, at, 0)[0]
 
     @contextmanager
     def _in_context(self) -> Iterator[None]:
@@ -234,12 +230,6 @@ class GpuLauncher:
             # A kernel handle can be launched like a function handle, in any context.
             self._functions[name] = self._driver.CUfunction(int(kernel))
             return self._functions[name]
-
-    def _allow(self, name: str, shared_bytes: int) -> None:
-        attribute = self._driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
-        kernel = self._driver.CUkernel(int(self._functions[name]))
-        call(self._driver, "cuKernelSetAttribute", attribute, shared_bytes, kernel, self._handle)
-        self._allowed[name] = shared_bytes
 
 
 def steps() -> str:
