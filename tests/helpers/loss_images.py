@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera, look_at
+from gs2d.losses import formulas
 from gs2d.render.types import RenderOutput
 
 
@@ -16,6 +17,41 @@ def make_camera(width: int, height: int) -> Camera:
         np.array([1.0, -2.0, 0.7]), np.zeros(3), np.array([0.1, 0.2, 1.0]), width=width, height=height, fx=1.0
     ).T_cam_world
     return Camera(width, height, 0.9 * width, 1.1 * width, 0.4 * width, 0.55 * height, T)
+
+
+def wide_camera(height: int, width: int) -> Camera:
+    """Return a camera without symmetries, of any size from one pixel on."""
+    T = make_camera(max(width, 1), max(height, 1)).T_cam_world
+    return Camera(width, height, 0.9 * width + 2, 1.1 * width + 2, 0.4 * width, 0.55 * height, T)
+
+
+def photographs(
+    height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a noisy rendering of a smooth target with some equal pixels, the target, and a mask."""
+    g = torch.Generator().manual_seed(seed)
+    target = formulas.blur(torch.rand(height, width, 3, generator=g, dtype=dtype))
+    rendered = (target + 0.2 * torch.randn(height, width, 3, generator=g, dtype=dtype)).clamp(0, 1)
+    rendered = torch.where(torch.rand(height, width, 1, generator=g) < 0.1, target, rendered)
+    return rendered, target, torch.rand(height, width, generator=g) < 0.8
+
+
+def geometry(
+    height: int, width: int, seed: int = 0, empty: float = 0.05, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return rendered normals, depth with holes, alpha and a mask."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=dtype)
+
+    depth = torch.where(rand(height, width) < empty, 0.0, 2 + rand(height, width))
+    return rand(height, width, 3) - 0.5, depth, rand(height, width), rand(height, width) < 0.85
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    """Return the relative Frobenius norm of a difference."""
+    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
 def make_output(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> RenderOutput:

@@ -2,84 +2,29 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from gs2d.core.camera import Camera, look_at
-from gs2d.errors import BackendError
 from gs2d.kernels import native_losses as ops
-from gs2d.kernels.library import Library, available_variants, load
+from gs2d.kernels.library import Library
 from gs2d.kernels.native_losses import NormalOptions
 from gs2d.losses import formulas as reference
+from loss_images import geometry, photographs, relative_error, wide_camera
 
 SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]
-
-
-@pytest.fixture(params=["v4", "v3", "portable"])
-def library(request: pytest.FixtureRequest) -> Library:
-    """Return each float32 library that this processor can run, with two threads."""
-    if request.param not in available_variants():
-        pytest.skip(f"this machine cannot run variant {request.param}, or the native library was not built")
-    library = load(request.param)
-    library.use_threads(2)
-    return library
-
-
-@pytest.fixture
-def double() -> Library:
-    """Return the float64 build of the same sources."""
-    try:
-        library = load("f64")
-    except BackendError as error:
-        pytest.skip(str(error))
-    library.use_threads(2)
-    return library
-
-
-def make_camera(height: int, width: int) -> Camera:
-    T = look_at(
-        np.array([1.0, -2.0, 0.7]), np.zeros(3), np.array([0.1, 0.2, 1.0]), width=width, height=height, fx=1.0
-    ).T_cam_world
-    return Camera(width, height, 0.9 * width + 2, 1.1 * width + 2, 0.4 * width, 0.55 * height, T)
-
-
-def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a noisy rendering of a smooth target with some equal pixels, the target, and a mask; float64."""
-    g = torch.Generator().manual_seed(seed)
-    target = reference.blur(torch.rand(height, width, 3, generator=g, dtype=torch.float64))
-    rendered = (target + 0.2 * torch.randn(height, width, 3, generator=g, dtype=torch.float64)).clamp(0, 1)
-    rendered = torch.where(torch.rand(height, width, 1, generator=g) < 0.1, target, rendered)
-    return rendered, target, torch.rand(height, width, generator=g) < 0.8
-
-
-def geometry(height: int, width: int, seed: int = 0, empty: float = 0.05) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return rendered normals, depth with holes, alpha and a mask; float64."""
-    g = torch.Generator().manual_seed(seed)
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=g, dtype=torch.float64)
-
-    depth = torch.where(rand(height, width) < empty, 0.0, 2 + rand(height, width))
-    return rand(height, width, 3) - 0.5, depth, rand(height, width), rand(height, width) < 0.85
-
-
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Return the relative Frobenius norm of a difference."""
-    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", SIZES)
 def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
-    library: Library, size: tuple[int, int], masked: bool
+    native: Library, size: tuple[int, int], masked: bool
 ) -> None:
     rendered, target, mask = photographs(*size)
     valid = mask if masked else None
     x, y = rendered.float().requires_grad_(), target.float()
     exact, exact_y = x.detach().double().requires_grad_(), y.double()  # exactly the inputs of the native op
-    values = ops.photometric(x, y, valid, library=library)
+    values = ops.photometric(x, y, valid, library=native)
     exact_values = [value(exact, exact_y, valid) for value in (reference.l1, reference.ssim, reference.l2)]
     for value, exact_value, atol in zip(values, exact_values, (1e-7, 1e-6, 1e-7), strict=True):
         assert value.item() == pytest.approx(exact_value.item(), abs=atol)
@@ -103,15 +48,15 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
 )
 @pytest.mark.parametrize("size", SIZES)
 def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
-    library: Library, size: tuple[int, int], per_splat: bool, masked: bool, edges: str, weighted: bool
+    native: Library, size: tuple[int, int], per_splat: bool, masked: bool, edges: str, weighted: bool
 ) -> None:
     *images, mask = geometry(*size, empty=0.3 if edges == "camera" else 0.05)
-    camera, valid = make_camera(*size), mask if masked else None
+    camera, valid = wide_camera(*size), mask if masked else None
     weights = torch.rand(size, generator=torch.Generator().manual_seed(1)) if weighted else None
     found_in = [image.float().requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in found_in]
     how = NormalOptions(camera, valid, weights, edges == "camera", per_splat)
-    value = ops.normal_consistency(*found_in, how, library=library)
+    value = ops.normal_consistency(*found_in, how, library=native)
     function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
     exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
@@ -139,13 +84,13 @@ def smoothness_inputs(size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Te
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", [*SIZES, (9, 33)])
 def test_normal_smoothness_and_its_gradient_are_those_of_the_reference(
-    library: Library, size: tuple[int, int], masked: bool
+    native: Library, size: tuple[int, int], masked: bool
 ) -> None:
     normal, alpha, flatness, mask = smoothness_inputs(size)
     given = (alpha, flatness, mask if masked else None)
     normal.requires_grad_()
     exact_normal = normal.detach().double().requires_grad_()
-    value = ops.normal_smoothness(normal, *given, expected=0.8, library=library)
+    value = ops.normal_smoothness(normal, *given, expected=0.8, library=native)
     exact = reference.normal_smoothness(exact_normal, *given)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
     for cotangent in (0.8, 3.0):  # the first matches the gradient computed in the forward pass
@@ -155,38 +100,38 @@ def test_normal_smoothness_and_its_gradient_are_those_of_the_reference(
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_the_masked_mean_and_its_gradient_are_those_of_the_reference(library: Library, size: tuple[int, int]) -> None:
+def test_the_masked_mean_and_its_gradient_are_those_of_the_reference(native: Library, size: tuple[int, int]) -> None:
     _, _, values, mask = geometry(*size)
     for valid in (None, mask, torch.zeros_like(mask)):
         x = values.float().requires_grad_()
         exact = x.detach().double().requires_grad_()
-        found, expected = ops.masked_mean(x, valid, library=library), reference.distortion(exact, valid)
+        found, expected = ops.masked_mean(x, valid, library=native), reference.distortion(exact, valid)
         assert found.item() == pytest.approx(expected.item(), abs=1e-6)
         (gradient,) = torch.autograd.grad(3 * found, x)
         torch.testing.assert_close(gradient, 3 * torch.autograd.grad(expected, exact)[0].float())
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, masked: bool) -> None:
+def test_the_native_formulas_pass_a_float64_gradient_check(native64: Library, masked: bool) -> None:
     size = (8, 9)
     rendered, target, mask = photographs(*size, seed=3)
     rendered = torch.where((rendered - target).abs() < 1e-3, target + 0.05, rendered)  # |x - y| has a kink
     valid = mask if masked else None
     assert torch.autograd.gradcheck(
-        lambda x: ops.photometric(x, target, valid, library=double), (rendered.requires_grad_(),)
+        lambda x: ops.photometric(x, target, valid, library=native64), (rendered.requires_grad_(),)
     )
     normal, depth, alpha, _ = geometry(*size, seed=4)
-    camera = make_camera(*size)
+    camera = wide_camera(*size)
     inputs = (normal.requires_grad_(), torch.where(depth > 0, depth, 2.5).requires_grad_(), alpha.requires_grad_())
     assert torch.autograd.gradcheck(
-        lambda *x: ops.normal_consistency(*x, NormalOptions(camera, valid, per_splat=True), library=double), inputs
+        lambda *x: ops.normal_consistency(*x, NormalOptions(camera, valid, per_splat=True), library=native64), inputs
     )
     how = NormalOptions(camera, valid)
     assert torch.autograd.gradcheck(  # alpha is detached in this form
-        lambda n, d: ops.normal_consistency(n, d, alpha.detach(), how, library=double),
+        lambda n, d: ops.normal_consistency(n, d, alpha.detach(), how, library=native64),
         inputs[:2],
     )
-    assert torch.autograd.gradcheck(lambda x: ops.masked_mean(x, valid, library=double), (inputs[2],))
+    assert torch.autograd.gradcheck(lambda x: ops.masked_mean(x, valid, library=native64), (inputs[2],))
     weights, empty = geometry(*size, seed=5)[2], geometry(*size, seed=6, empty=0.3)[1] == 0
     assert torch.autograd.gradcheck(
         lambda n, d: ops.normal_consistency(
@@ -194,72 +139,72 @@ def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, mask
             torch.where(empty, 0.0, d),
             alpha.detach(),
             NormalOptions(camera, valid, weights, at_camera=True),
-            library=double,
+            library=native64,
         ),
         inputs[:2],
     )
 
 
-def everything(library: Library, height: int = 150, width: int = 41) -> list[Tensor]:
+def everything(native: Library, height: int = 150, width: int = 41) -> list[Tensor]:
     """Return values and gradients of every native loss."""
     rendered, target, mask = photographs(height, width, seed=6)
     normal, depth, alpha, _ = geometry(height, width, seed=7)
     leaves = [image.float().requires_grad_() for image in (rendered, normal, depth, alpha)]
     x, n, z, a = leaves
-    y, camera = target.float(), make_camera(height, width)
+    y, camera = target.float(), wide_camera(height, width)
     values = [
-        *ops.photometric(x, y, mask, library=library),
-        *ops.photometric(x, y, library=library),
-        ops.normal_consistency(n, z, a, NormalOptions(camera, mask), library=library),
-        ops.normal_consistency(n, z, a, NormalOptions(camera, per_splat=True), library=library),
-        ops.normal_consistency(n, z, a, NormalOptions(camera, weights=y[..., 0], at_camera=True), library=library),
-        ops.masked_mean(a, mask, library=library),
+        *ops.photometric(x, y, mask, library=native),
+        *ops.photometric(x, y, library=native),
+        ops.normal_consistency(n, z, a, NormalOptions(camera, mask), library=native),
+        ops.normal_consistency(n, z, a, NormalOptions(camera, per_splat=True), library=native),
+        ops.normal_consistency(n, z, a, NormalOptions(camera, weights=y[..., 0], at_camera=True), library=native),
+        ops.masked_mean(a, mask, library=native),
     ]
-    return [*values, *torch.autograd.grad(sum(values), leaves), ops.blur(y, library=library)]
+    return [*values, *torch.autograd.grad(sum(values), leaves), ops.blur(y, library=native)]
 
 
-def test_every_bit_is_the_same_for_any_number_of_threads(library: Library) -> None:
-    library.use_threads(1)
-    expected = everything(library)
+def test_every_bit_is_the_same_for_any_number_of_threads(native: Library) -> None:
+    native.use_threads(1)
+    expected = everything(native)
     for threads in (2, 3, 7):
-        library.use_threads(threads)
-        for found, wanted in zip(everything(library), expected, strict=True):
+        native.use_threads(threads)
+        for found, wanted in zip(everything(native), expected, strict=True):
             assert torch.equal(found, wanted)
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_a_cached_target_mean_changes_no_bit(library: Library, masked: bool) -> None:
+def test_a_cached_target_mean_changes_no_bit(native: Library, masked: bool) -> None:
     rendered, target, mask = photographs(45, 38, seed=8)
     x, y, valid = rendered.float().requires_grad_(), target.float(), mask if masked else None
     results = []
-    for mean in (None, ops.blur(y, library=library)):
-        l1, ssim, l2 = ops.photometric(x, y, valid, mean, library=library)
+    for mean in (None, ops.blur(y, library=native)):
+        l1, ssim, l2 = ops.photometric(x, y, valid, mean, library=native)
         results.append((l1, ssim, l2, *torch.autograd.grad(0.8 * l1 - 0.2 * ssim + l2, x)))
     for found, wanted in zip(*results, strict=True):
         assert torch.equal(found, wanted)
 
 
-def test_nan_at_a_valid_pixel_reaches_the_loss(library: Library) -> None:
+def test_nan_at_a_valid_pixel_reaches_the_loss(native: Library) -> None:
     rendered, target, _ = photographs(20, 20)
     x = rendered.float()
     x[3, 4, 1] = float("nan")
-    assert all(value.isnan() for value in ops.photometric(x, target.float(), library=library))
-    camera = make_camera(20, 20)
+    assert all(value.isnan() for value in ops.photometric(x, target.float(), library=native))
+    camera = wide_camera(20, 20)
     for bad in range(3):
         images = [image.float() for image in geometry(20, 20)[:3]]
         images[1][images[1] == 0] = 2.5
         images[bad][7, 8] = float("nan")
-        assert ops.normal_consistency(*images, NormalOptions(camera), library=library).isnan()
+        assert ops.normal_consistency(*images, NormalOptions(camera), library=native).isnan()
         assert reference.normal_consistency(*images, camera).isnan()
         images[1][7, 7] = 0  # beside it
-        assert ops.normal_consistency(*images, NormalOptions(camera, at_camera=True), library=library).isnan()
+        assert ops.normal_consistency(*images, NormalOptions(camera, at_camera=True), library=native).isnan()
         assert reference.normal_consistency(*images, camera, edges="camera").isnan()
 
 
-def test_a_target_changed_before_backward_is_an_error_not_a_wrong_gradient(library: Library) -> None:
+def test_a_target_changed_before_backward_is_an_error_not_a_wrong_gradient(native: Library) -> None:
     rendered, target, _ = photographs(9, 9)
     x, y = rendered.float().requires_grad_(), target.float().contiguous()
-    l1, *_ = ops.photometric(x, y, library=library)
+    l1, *_ = ops.photometric(x, y, library=native)
     y.zero_()
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         l1.backward()

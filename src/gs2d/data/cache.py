@@ -157,12 +157,11 @@ class ReadAhead:
     ----------
     load : callable
         Requests the image of an index.
-    threads : int
     """
 
-    def __init__(self, load: Callable[[int], object], threads: int = 2) -> None:
+    def __init__(self, load: Callable[[int], object]) -> None:
         self._load = load
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="read-ahead")
+        self._pool = ThreadPoolExecutor(2, thread_name_prefix="read-ahead")
         self._asked: set[int] = set()
 
     def expect(self, indices: Sequence[int]) -> None:

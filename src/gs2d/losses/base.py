@@ -42,18 +42,10 @@ __all__ = [
     "normals_from_depth",
     "register_loss",
     "ssim",
-    "target_mean",
 ]
 
 SETTINGS = ("depth_prior", "normal_prior")
 """Fields of a recipe that only losses use."""
-
-
-def target_mean(target: Tensor, backend: str | Backend = "cpu") -> Tensor | None:
-    """Return the local mean of a target [H, W, 3] for ``LossView.target_mean``; None if the backend takes none."""
-    check_shapes({"target": (target, "H W 3")})
-    operations = _operations(backend, target.device)
-    return None if operations is None or operations.blur is None else operations.blur(target)
 
 
 def _operations(backend: str | Backend, device: torch.device) -> LossOperations | None:
@@ -87,7 +79,7 @@ class LossView:
     flatness : Tensor [H, W] uint8 or None
         ``formulas.flatness`` of the image, if an active loss needs it.
     target_mean : Tensor [H, W, 3] or None
-        Result of :func:`target_mean` for ``target``. It saves the native SSIM one blur of four, without changing a
+        Local mean of ``target`` (``LossOperations.blur``), which saves the native SSIM one blur of four and changes no
         value.
     weights : mapping of kind to float
         Weights of the active terms, set by :func:`compute_losses`. Fused forms prepare their gradients for them.
@@ -370,7 +362,6 @@ def ssim(
     mask: Tensor | None = None,
     *,
     backend: str | Backend,
-    target_mean: Tensor | None = None,
 ) -> Tensor:
     """Mean SSIM [] over valid pixels, for evaluation (the loss "ssim" is 1 minus this).
 
@@ -380,8 +371,6 @@ def ssim(
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
     backend : str or Backend
-    target_mean : Tensor [H, W, 3], optional
-        ``target_mean(target)``.
 
     Raises
     ------
@@ -390,5 +379,5 @@ def ssim(
     """
     fused = _operations(backend, image.device)
     if fused is not None:
-        return fused.photometric(image, target, mask, target_mean)[1]
+        return fused.photometric(image, target, mask)[1]
     return formulas.ssim(image, target, mask)

@@ -4,50 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import emulate
-from gs2d.core.camera import Camera, look_at
 from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.native_losses import NormalOptions
 from gs2d.losses import formulas as reference
+from loss_images import geometry, photographs, relative_error, wide_camera
 
 # Smaller than the window; a single row; just over one strip of 128 reals (43 pixels) or 32 rows.
 SIZES = [(1, 1), (5, 3), (37, 44), (33, 20)]
-
-
-def make_camera(height: int, width: int) -> Camera:
-    T = look_at(
-        np.array([1.0, -2.0, 0.7]), np.zeros(3), np.array([0.1, 0.2, 1.0]), width=width, height=height, fx=1.0
-    ).T_cam_world
-    return Camera(width, height, 0.9 * width + 2, 1.1 * width + 2, 0.4 * width, 0.55 * height, T)
-
-
-def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a noisy rendering with some pixels equal to the target, the target, and a mask; float32."""
-    g = torch.Generator().manual_seed(seed)
-    target = reference.blur(torch.rand(height, width, 3, generator=g))
-    rendered = (target + 0.2 * torch.randn(height, width, 3, generator=g)).clamp(0, 1)
-    rendered = torch.where(torch.rand(height, width, 1, generator=g) < 0.1, target, rendered)
-    return rendered, target, torch.rand(height, width, generator=g) < 0.8
-
-
-def geometry(height: int, width: int, seed: int = 0, empty: float = 0.05) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return rendered normals, depth with holes, alpha and a mask; float32."""
-    g = torch.Generator().manual_seed(seed)
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=g)
-
-    depth = torch.where(rand(height, width) < empty, 0.0, 2 + rand(height, width))
-    return rand(height, width, 3) - 0.5, depth, rand(height, width), rand(height, width) < 0.85
-
-
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -55,7 +22,7 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
 def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
     emulator: emulate.Emulator, size: tuple[int, int], masked: bool
 ) -> None:
-    x, y, mask = photographs(*size)
+    x, y, mask = photographs(*size, dtype=torch.float32)
     x.requires_grad_()
     valid = mask if masked else None
     exact = x.detach().double().requires_grad_()
@@ -71,13 +38,13 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
 
 
 def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emulator) -> None:
-    x, y, _ = photographs(7, 6)
+    x, y, _ = photographs(7, 6, dtype=torch.float32)
     nothing = torch.zeros(7, 6, dtype=torch.bool)
     x.requires_grad_()
     l1, ssim, l2 = ops.photometric(x, y, nothing, launcher=emulator)
-    normal, depth, alpha, _ = geometry(7, 6)
+    normal, depth, alpha, _ = geometry(7, 6, dtype=torch.float32)
     mean = ops.masked_mean(x[..., 0], nothing, launcher=emulator)
-    seen = NormalOptions(make_camera(7, 6), nothing)
+    seen = NormalOptions(wide_camera(7, 6), nothing)
     consistency = ops.normal_consistency(normal, depth, alpha, seen, launcher=emulator)
     assert [l1.item(), ssim.item(), l2.item(), mean.item(), consistency.item()] == [0.0] * 5
     (gradient,) = torch.autograd.grad(l1 + ssim + l2 + mean, x)
@@ -98,8 +65,8 @@ def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emul
 def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     emulator: emulate.Emulator, size: tuple[int, int], per_splat: bool, masked: bool, edges: str, weighted: bool
 ) -> None:
-    *images, mask = geometry(*size, empty=0.3 if edges == "camera" else 0.05)
-    camera, valid = make_camera(*size), mask if masked else None
+    *images, mask = geometry(*size, empty=0.3 if edges == "camera" else 0.05, dtype=torch.float32)
+    camera, valid = wide_camera(*size), mask if masked else None
     weights = torch.rand(size, generator=torch.Generator().manual_seed(1)) if weighted else None
     found_in = [image.requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in images]
@@ -124,7 +91,7 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
 def test_normal_smoothness_and_its_gradient_are_those_of_the_reference(
     emulator: emulate.Emulator, size: tuple[int, int], masked: bool
 ) -> None:
-    normal, _, alpha, mask = geometry(*size)
+    normal, _, alpha, mask = geometry(*size, dtype=torch.float32)
     flatness = torch.randint(0, 256, size, generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
     given = (alpha, flatness, mask if masked else None)
     normal.requires_grad_()
@@ -142,7 +109,10 @@ def test_the_mean_of_a_map_and_its_gradient_are_those_of_the_reference(
     emulator: emulate.Emulator, masked: bool
 ) -> None:
     """35 x 31 pixels are more than one block of 1024."""
-    values, mask = torch.randn(35, 31, generator=torch.Generator().manual_seed(0)), photographs(35, 31)[2]
+    values, mask = (
+        torch.randn(35, 31, generator=torch.Generator().manual_seed(0)),
+        photographs(35, 31, dtype=torch.float32)[2],
+    )
     values.requires_grad_()
     exact = values.detach().double().requires_grad_()
     found = ops.masked_mean(values, mask if masked else None, launcher=emulator)
@@ -154,8 +124,8 @@ def test_the_mean_of_a_map_and_its_gradient_are_those_of_the_reference(
 
 def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: emulate.Emulator) -> None:
     """Sums have a fixed order; a missing barrier would also show."""
-    x, y, mask = photographs(37, 44)
-    *images, _ = geometry(37, 44)
+    x, y, mask = photographs(37, 44, dtype=torch.float32)
+    *images, _ = geometry(37, 44, dtype=torch.float32)
     results = []
     for launcher in (
         emulator,
@@ -165,7 +135,7 @@ def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: em
     ):
         z, depth = x.clone().requires_grad_(), images[1].clone().requires_grad_()
         values = ops.photometric(z, y, mask, launcher=launcher)
-        seen = NormalOptions(make_camera(37, 44), mask)
+        seen = NormalOptions(wide_camera(37, 44), mask)
         consistency = ops.normal_consistency(images[0], depth, images[2], seen, launcher=launcher)
         mean = ops.masked_mean(x[..., 0], mask, launcher=launcher)
         results.append((*values, consistency, mean, *torch.autograd.grad(sum(values) + consistency, (z, depth))))

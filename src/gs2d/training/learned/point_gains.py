@@ -31,13 +31,10 @@ class PointGains:
         Gain of each image and channel; the geometric mean over images is 1.
     spread : float
         Standard deviation over images of the logarithm of the mean gain of the channels.
-    residual : float
-        Median residual of the logarithms.
     """
 
     gains: np.ndarray
     spread: float
-    residual: float
 
 
 def point_gains(scene: Scene) -> PointGains | None:
@@ -77,10 +74,9 @@ def _colors(view: View, observed: ObservedPoints) -> tuple[np.ndarray, np.ndarra
 def _fitted(views: np.ndarray, points: np.ndarray, values: np.ndarray, count: int) -> PointGains:
     """Return the gains of ``count`` views from the logarithms [M, 3] of point colours."""
     if len(values) == 0:
-        return PointGains(np.ones((count, 3)), 0.0, 0.0)
+        return PointGains(np.ones((count, 3)), 0.0)
     _, points = np.unique(points, return_inverse=True)
     logs, weights = np.zeros((count, 3)), np.ones(len(values))
-    error = np.zeros(len(values))
     for _ in range(ROUNDS):
         colors = _means(points, values - logs[views], weights, int(points.max()) + 1)
         left = values - colors[points]
@@ -89,7 +85,7 @@ def _fitted(views: np.ndarray, points: np.ndarray, values: np.ndarray, count: in
         logs -= logs.mean(axis=0)
         error = np.abs(left - logs[views]).mean(axis=1)
         weights = 1 / (1 + (error / OUTLIER) ** 2)
-    return PointGains(np.exp(logs), float(logs.mean(axis=1).std()), float(np.median(error)))
+    return PointGains(np.exp(logs), float(logs.mean(axis=1).std()))
 
 
 def _means(groups: np.ndarray, values: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
