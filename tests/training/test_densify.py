@@ -11,9 +11,9 @@ from gs2d.config.recipe import GradDensify
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
+from gs2d.kernels.torch_kernels import accumulate
 from gs2d.training.densify.gradient import (
     DensifyCounts,
-    accumulate,
     densify_and_prune,
     limit_opacity,
     no_statistics,
@@ -54,8 +54,8 @@ def run(state: TrainState, densify: GradDensify | None = None, iteration: int = 
 def test_statistics_add_norms_of_visible_splats() -> None:
     statistics = no_statistics(random_splats(3))
     signal = torch.tensor([[3.0, 4.0, 6.0, 8.0], [1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 5.0, 12.0]])
-    accumulate(statistics, signal, torch.tensor([2.0, 0.0, 1.0]))
-    accumulate(statistics, signal, torch.tensor([2.0, 0.0, 0.0]))
+    accumulate(*statistics.values(), signal, torch.tensor([2.0, 0.0, 1.0]))
+    accumulate(*statistics.values(), signal, torch.tensor([2.0, 0.0, 0.0]))
     assert statistics["signed"].tolist() == [10.0, 0.0, 0.0]
     assert statistics["absolute"].tolist() == [20.0, 0.0, 13.0]
     assert statistics["count"].tolist() == [2.0, 0.0, 1.0]

@@ -186,18 +186,9 @@ class FullRender:
         given = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
         return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
 
-    def _points(self, camera: Camera, target: Target) -> ImagePoints:
-        """Return the pixels of a training image."""
-        return ImagePoints(camera, target.silhouette, None if target.silhouette is None else self._background)
-
-    @torch.no_grad()
-    def report(
-        self, state: TrainState, index: int, settings: RasterSettings, backend: Backend
-    ) -> dict[str, LossReport]:
-        """Return the reports of the losses on the current rendering of training view ``index``."""
-        camera, target = self.camera(state, index), self.targets[index]
-        output = rasterize(self.drawn(state.splats), camera, settings, backend=backend)
-        view = LossView(
+    def _compared(self, index: int, camera: Camera, target: Target) -> LossView:
+        """Return what the losses compare with a rendering of training view ``index``."""
+        return LossView(
             target.image,
             camera,
             target.mask,
@@ -205,7 +196,17 @@ class FullRender:
             depth_kind=self.protocol.depth,
             silhouette=target.silhouette,
             flatness=target.flatness,
+            target_mean=target.mean,
         )
+
+    @torch.no_grad()
+    def report(
+        self, state: TrainState, index: int, settings: RasterSettings, backend: Backend
+    ) -> dict[str, LossReport]:
+        """Return the reports of the losses on the current rendering of training view ``index``."""
+        camera = self.camera(state, index)
+        output = rasterize(self.drawn(state.splats), camera, settings, backend=backend)
+        view = self._compared(index, camera, self.targets[index])
         reports = {name: loss.report(output, view) for name, loss in self.losses.reporters.items()}
         return {name: report for name, report in reports.items() if report is not None}
 
@@ -223,22 +224,12 @@ class FullRender:
         """
         index, camera, output, leaves = rendered.index, rendered.camera, rendered.output, rendered.leaves
         target = self.targets[index]
-        at = self._points(camera, target)
+        at = ImagePoints(camera, target.silhouette, None if target.silhouette is None else self._background)
         numbers = self.learned.leaves(state.learned, index, camera, output.color)
         if numbers:
             output = replace(output, color=shown(output.color, numbers, at, clipped_pixels(target)))
-        view = LossView(
-            target.image,
-            camera,
-            target.mask,
-            iteration=iteration,
-            run_iteration=sum(earlier.iterations for earlier in self.recipe.stages[: state.stage]) + iteration,
-            index=index,
-            depth_kind=self.protocol.depth,
-            silhouette=target.silhouette,
-            flatness=target.flatness,
-            target_mean=target.mean,
-        )
+        before = sum(earlier.iterations for earlier in self.recipe.stages[: state.stage])
+        view = replace(self._compared(index, camera, target), iteration=iteration, run_iteration=before + iteration)
         resolved = self.protocol.resolve(stage.losses)
         terms = compute_losses(output, view, resolved, backend=self.backend, losses=self.losses)
         terms |= self.learned.penalties(numbers, index)

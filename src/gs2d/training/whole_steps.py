@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import is_not
 from types import MappingProxyType
 from typing import Any
 
@@ -113,10 +114,6 @@ class WholeSteps:
     def _learning_rows(self, state: TrainState) -> Tensor | None:
         """Return the splats that the stage trains, computed anew when the groups have changed."""
         groups = tuple(state.groups[group] for group in set(self._stage.train.values()) - {"all"})
-        if self._rows is None or len(groups) != len(self._rows[0]) or any(map(_differ, groups, self._rows[0])):
+        if self._rows is None or len(groups) != len(self._rows[0]) or any(map(is_not, groups, self._rows[0])):
             self._rows = groups, learning_rows(state, self._stage)
         return self._rows[1]
-
-
-def _differ(a: Tensor, b: Tensor) -> bool:
-    return a is not b

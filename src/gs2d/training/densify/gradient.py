@@ -18,8 +18,6 @@ from gs2d.config.recipe import GradDensify
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
-from gs2d.render.backends import Backend
-from gs2d.render.reference_backend import PLAIN
 from gs2d.training import events
 from gs2d.training.densify.densifier import Densifier, Surroundings
 from gs2d.training.rows import append_rows
@@ -106,10 +104,12 @@ class GradientDensifier(Densifier):
         return happened
 
     def _add(self, statistics: Mapping[str, Tensor], output: StepResult) -> None:
-        """Add the statistics of the view of this process."""
-        assert output.signal is not None
-        assert output.radii is not None
-        accumulate(statistics, output.signal, output.radii, self.surroundings.backend)
+        """Add the statistics of the view of this process; splats with radius 0 are not counted."""
+        signal, radii = output.signal, output.radii
+        assert signal is not None
+        assert radii is not None
+        sums = (statistics["signed"], statistics["absolute"], statistics["count"])
+        self.surroundings.backend.accumulate(*sums, signal, radii)
 
 
 def no_statistics(splats: Splats) -> dict[str, Tensor]:
@@ -126,24 +126,6 @@ class DensifyCounts:
     split: int
     pruned_by_opacity: int
     pruned_large: int
-
-
-@torch.no_grad()
-def accumulate(statistics: Mapping[str, Tensor], signal: Tensor, radii: Tensor, backend: Backend = PLAIN) -> None:
-    """Add the statistics of one view.
-
-    Parameters
-    ----------
-    statistics : mapping of "signed", "absolute" and "count" to Tensor [N]
-        Changed in place.
-    signal : Tensor [N, 2] or [N, 4]
-        Gradient of the screen probe: signed in columns 0:2, absolute in 2:4.
-    radii : Tensor [N] px
-        Splats with radius 0 are not counted.
-    backend : Backend
-        By default plain torch.
-    """
-    backend.accumulate(statistics["signed"], statistics["absolute"], statistics["count"], signal, radii)
 
 
 @torch.no_grad()
