@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -23,14 +24,16 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 + 0.4 * np.tanh(0.3 * value))
 
 
-def image(camera: Camera, gain: float = 1.0) -> np.ndarray:
-    """Render the wall from a camera at z = 0, uint8; its left third has no texture."""
+def image(
+    camera: Camera, gain: float = 1.0, bare: Callable[[np.ndarray], np.ndarray] = lambda places: places[..., 0] < -1.2
+) -> np.ndarray:
+    """Render the wall from a camera at z = 0, uint8; its left third, or where ``bare`` is true, has no texture."""
     x = (np.arange(WIDTH) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(HEIGHT) + 0.5 - camera.cy) / camera.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((HEIGHT, WIDTH))], axis=-1) @ camera.rotation
     places = camera.center + rays * ((WALL - camera.center[2]) / rays[..., 2])[..., None]
     color = texture(places[..., 0], places[..., 1])
-    color[places[..., 0] < -1.2] = 0.5
+    color[bare(places)] = 0.5
     return np.rint(np.clip(color * gain, 0, 1) * 255).astype(np.uint8)
 
 

@@ -25,6 +25,8 @@ from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
 from gs2d.kernels.sweep import BestPlanes, sweep_planes
+from gs2d.losses.formulas import flatness
+from gs2d.training.start.closing import closed_depth, enclosed
 from gs2d.training.start.sweep_range import SweepRange, sweep_range
 
 PLANES = 64  # depths that are tried for each pixel
@@ -45,6 +47,9 @@ TRIM_EVERY = 8  # views between returns of freed memory, which would add up to 2
 PLANES_AT_ONCE = 16  # 5 MB for each intermediate tensor at 200 px
 SWEEP_BYTES = 1 << 30  # limit for each of downscaled views, depths and free space; the rest goes to the disk
 WAITING = 500_000  # points that are collected before they are thinned
+BARE = 127  # flatness, 0 to 255, of pixels whose depth is interpolated
+CLOSED_AGREE = 0.03  # as AGREE, of interpolated depths
+CLOSED_CELL = 2.0  # cells of swept points: interpolated ones are sparser, since they have no detail
 REPEATED = 3.0  # cells: nearer to a swept point, a sparse point starts no splat of its own
 
 T = TypeVar("T")
@@ -110,6 +115,14 @@ class Sweep:
     neighbours: tuple[tuple[int, ...], ...]
     depths: Sequence[np.ndarray]
     scores: Sequence[np.ndarray]
+
+    def quorum(self, index: int) -> int:
+        """Return how many neighbours of a view must agree on a depth."""
+        return min(VOTES, max(1, len(self.neighbours[index]) - 1))
+
+    def known(self, index: int) -> np.ndarray:
+        """Return the pixels on whose depth enough neighbours agree, bool [H, W]."""
+        return self.agreeing(index, AGREE) >= self.quorum(index)
 
     def agreeing(self, index: int, fraction: float) -> np.ndarray:
         """Return the number of neighbours that have the same depth for the point of each pixel, int [H, W]."""
@@ -196,8 +209,9 @@ def start_points(
             "--set dense_start=null"
         )
     swept = _thinned((_swept(sweep, index) for index in range(len(sweep.views))), settings.cell)
+    between = _between(sweep, swept, settings.cell)
     parts: list[tuple[np.ndarray, ...]] = [
-        (swept.places, swept.colors, swept.normals, np.zeros(len(swept.places))),
+        (found.places, found.colors, found.normals, np.zeros(len(found.places))) for found in (swept, between)
     ]
     if scene.points is not None and _has_points(scene):
         parts.append(_apart(scene.points, swept, settings.cell))
@@ -227,6 +241,10 @@ class _Found:
     pixel: np.ndarray  # [M] world units: the size of a pixel there
     score: np.ndarray  # [M]
 
+    def rows(self, which: np.ndarray) -> _Found:
+        """Return some of the points."""
+        return _Found(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
 
 def _joined(found: Sequence[_Found]) -> _Found:
     return _Found(*(np.concatenate([getattr(f, name) for f in found]) for name in _Found.__dataclass_fields__))
@@ -248,8 +266,7 @@ def _thin(found: _Found, cell: float) -> _Found:
     keys = np.concatenate([np.floor(found.places / np.exp2(level)[:, None]), level[:, None]], axis=1)
     order = np.argsort(-found.score, kind="stable")
     _, first = _unique_rows(keys[order])
-    rows = order[first]
-    return _Found(*(getattr(found, name)[rows] for name in _Found.__dataclass_fields__))
+    return found.rows(order[first])
 
 
 def _unique_rows(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -267,13 +284,47 @@ def _unique_rows(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _swept(sweep: Sweep, index: int) -> _Found:
     """Return the points of a view on which enough neighbours agree."""
-    view, depth = sweep.views[index], sweep.depths[index]
+    return _found(sweep.views[index], sweep.depths[index], sweep.known(index), sweep.scores[index])
+
+
+def _found(view: SmallView, depth: np.ndarray, kept: np.ndarray, score: np.ndarray) -> _Found:
+    """Return the points of the pixels of a view that are ``kept`` [H, W]."""
     places = unproject(view, depth)
-    kept = sweep.agreeing(index, AGREE) >= min(VOTES, max(1, len(sweep.neighbours[index]) - 1))
     normals = np.cross(np.gradient(places, axis=1), np.gradient(places, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     colors = view.color.permute(1, 2, 0).numpy()
-    return _Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], sweep.scores[index][kept])
+    return _Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], score[kept])
+
+
+def _between(sweep: Sweep, swept: _Found, cell: float) -> _Found:
+    """Return interpolated points where no swept ones are: neighbours agree on them, and none sees through them."""
+    from scipy.spatial import cKDTree
+
+    def closed(index: int) -> tuple[np.ndarray, np.ndarray]:
+        view, known = sweep.views[index], sweep.known(index)
+        color = view.color.permute(1, 2, 0).numpy()
+        depth = closed_depth(sweep.depths[index], known, color, view.usable)
+        return np.where(known, depth, -depth).astype(np.float32), known
+
+    count, tree = len(sweep.views), cKDTree(swept.places)
+    depths = Spilled(map(closed, range(count)), cache_bytes(SWEEP_BYTES))
+
+    def agreed(index: int) -> _Found:
+        view, (signed, known) = sweep.views[index], depths[index]
+        bare = flatness(view.color.permute(1, 2, 0)).numpy() > BARE
+        depth, kept = np.abs(signed).astype(np.float64), enclosed(known) & view.usable & bare & (signed < 0)
+        places = unproject(view, depth)[kept]
+        votes, seen_through = np.zeros(len(places), np.int64), np.zeros(len(places), bool)
+        for other in sweep.neighbours[index]:
+            z, column, row, inside = project(sweep.views[other], places)
+            there = depths[other][0][row, column]
+            votes += inside & (np.abs(np.abs(there) - z) <= CLOSED_AGREE * z)
+            seen_through |= inside & (there > (1 + 2 * CLOSED_AGREE) * z)
+        kept[kept] = (votes >= sweep.quorum(index)) & ~seen_through
+        found = _found(view, depth, kept, np.zeros_like(depth))
+        return found.rows(tree.query(found.places)[0] > cell * found.pixel)
+
+    return _thinned(map(agreed, range(count)), CLOSED_CELL * cell)
 
 
 def _apart(points: PointCloud, swept: _Found, cell: float) -> tuple[np.ndarray, ...]:
