@@ -29,7 +29,8 @@ from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm.photos import Photo, camera_groups, find_photos, panorama_groups, read_photos
 from gs2d.training.events import Event, Notice
-from gs2d.training.start.plane_sweep import start_points, sweep_views
+from gs2d.training.start.plane_sweep import sweep_views
+from gs2d.training.start.start_points import start_points
 
 WIDTH = 768
 WHOLE = (

@@ -10,7 +10,8 @@ import pytest
 from gs2d.config.robust import DenseStart
 from gs2d.data.scene import Scene, View
 from gs2d.training.start.closing import closed_depth, enclosed
-from gs2d.training.start.plane_sweep import start_points, sweep_views
+from gs2d.training.start.plane_sweep import sweep_views
+from gs2d.training.start.start_points import start_points
 from wall_scene import WALL, image, wall
 
 SHAPE = (14, 18)
@@ -56,7 +57,7 @@ def test_only_pixels_between_known_ones_are_enclosed() -> None:
 
 
 def bare(places: np.ndarray) -> np.ndarray:
-    return np.asarray((np.abs(places[..., 0] - 0.2) < 0.7) & (np.abs(places[..., 1]) < 0.6))
+    return np.asarray((np.abs(places[..., 0] - 0.2) < 1.1) & (np.abs(places[..., 1]) < 0.9))
 
 
 def patched() -> Scene:
@@ -66,7 +67,7 @@ def patched() -> Scene:
 
 
 def in_patch(points: np.ndarray) -> np.ndarray:
-    return np.asarray(points[(np.abs(points[:, 0] - 0.2) < 0.45) & (np.abs(points[:, 1]) < 0.35)])
+    return np.asarray(points[(np.abs(points[:, 0] - 0.2) < 0.6) & (np.abs(points[:, 1]) < 0.4)])
 
 
 def test_points_start_on_a_bare_part_of_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,5 +76,5 @@ def test_points_start_on_a_bare_part_of_a_wall(monkeypatch: pytest.MonkeyPatch) 
     found = in_patch(start_points(scene, sweep, settings).points)
     assert len(found) >= 4
     np.testing.assert_allclose(found[:, 2], WALL, rtol=0.03)
-    monkeypatch.setattr("gs2d.training.start.plane_sweep.closed_depth", lambda depth, *_: np.zeros_like(depth))
+    monkeypatch.setattr("gs2d.training.start.start_points.closed_depth", lambda depth, *_: np.zeros_like(depth))
     assert len(in_patch(start_points(scene, sweep, settings).points)) < len(found) / 3

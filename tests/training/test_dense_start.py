@@ -22,8 +22,9 @@ from gs2d.evaluation.image_metrics import psnr_float
 from gs2d.pipeline.train.run_logger import start_text
 from gs2d.render.api import rasterize
 from gs2d.training.events import Initialised
-from gs2d.training.start.plane_sweep import Sweep, start_points, sweep_views
+from gs2d.training.start.plane_sweep import Sweep, sweep_views
 from gs2d.training.start.start_fit import fit_start
+from gs2d.training.start.start_points import start_points
 from gs2d.training.start.sweep_range import sweep_range
 from gs2d.training.trainer import Trainer
 from tiny import RADIUS, ball_image

@@ -33,7 +33,8 @@ from gs2d.training.robust.robustness import Robustness
 from gs2d.training.robust.seen_area import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.start.initialize import initial_splats
-from gs2d.training.start.plane_sweep import start_points, sweep_views
+from gs2d.training.start.plane_sweep import sweep_views
+from gs2d.training.start.start_points import start_points
 from gs2d.training.trainer import Trainer
 from train_toys import full_state, make_scene, random_splats
 from wall_scene import HEIGHT, WALL, WIDTH, wall

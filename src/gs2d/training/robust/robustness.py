@@ -32,8 +32,9 @@ from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.rows import keep_rows
 from gs2d.training.start.background_sphere import sphere_points
 from gs2d.training.start.initialize import Initial
-from gs2d.training.start.plane_sweep import SmallView, Sweep, start_points, sweep_views
+from gs2d.training.start.plane_sweep import SmallView, Sweep, sweep_views
 from gs2d.training.start.start_fit import fit_start
+from gs2d.training.start.start_points import start_points
 from gs2d.training.state import TrainState
 
 PARTS = 5  # of a stage: at the end of each, all proposed splats are tried again, also those that were missed before
