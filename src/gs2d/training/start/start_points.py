@@ -145,19 +145,20 @@ def _between(sweep: Sweep, swept: _Found, cell: float) -> _Found:
     """Return interpolated points where no swept ones are: neighbours agree on them, and none sees through them."""
 
     def closed(index: int) -> tuple[np.ndarray, np.ndarray]:
-        view, known = sweep.views[index], sweep.known(index)
-        color = view.color.permute(1, 2, 0).numpy()
-        depth = closed_depth(sweep.depths[index], known, color, view.usable)
-        return np.where(known, depth, -depth).astype(np.float32), known
+        """Return the closed depth map, negative where it is interpolated, and the pixels that may start a splat."""
+        view, depth, known = sweep.views[index], sweep.depths[index], sweep.known(index)
+        color = view.color.permute(1, 2, 0)
+        wanted = enclosed(known) & view.usable & (flatness(color).numpy() > BARE)
+        wanted &= distance_transform_edt(~known) >= MARGIN
+        filled = closed_depth(depth, known, color.numpy(), view.usable) if wanted.any() else np.zeros_like(depth)
+        return np.where(known, depth, -filled).astype(np.float32), wanted
 
     count, tree = len(sweep.views), cKDTree(swept.places)
     depths = Spilled(map(closed, range(count)), cache_bytes(SWEEP_BYTES))
 
     def agreed(index: int) -> _Found:
-        view, (signed, known) = sweep.views[index], depths[index]
-        bare = flatness(view.color.permute(1, 2, 0)).numpy() > BARE
-        depth, kept = np.abs(signed).astype(np.float64), enclosed(known) & view.usable & bare & (signed < 0)
-        kept &= distance_transform_edt(~known) >= MARGIN
+        view, (signed, wanted) = sweep.views[index], depths[index]
+        depth, kept = np.abs(signed).astype(np.float64), wanted & (signed < 0)
         places = unproject(view, depth)[kept]
         votes, seen_through = np.zeros(len(places), np.int64), np.zeros(len(places), bool)
         for other in sweep.neighbours[index]:
