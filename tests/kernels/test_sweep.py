@@ -11,7 +11,7 @@ import torch
 from gs2d.config.robust import DenseStart
 from gs2d.kernels.library import Library, available_variants, library_for
 from gs2d.training.start import plane_sweep
-from gs2d.training.start.plane_sweep import SmallView, best_planes, best_planes_reference, sweep_views
+from gs2d.training.start.plane_sweep import SmallView, Windows, best_planes, best_planes_reference, sweep_views
 from wall_scene import WALL, wall
 
 Z = 1 / torch.linspace(1 / 7.0, 1 / 2.5, 23)
@@ -29,6 +29,10 @@ def views() -> list[SmallView]:
     return list(sweep_views(wall(), DenseStart(side=48, min_angle=1.0)).views)
 
 
+def windows(radius: int) -> Windows:
+    return Windows(radius, noise=1e-4, texture=2e-5)
+
+
 def assert_like(score: torch.Tensor, true: torch.Tensor, view: SmallView) -> None:
     """Compare float32 scores: a textureless patch has a variance of 1e-4 (noise), of which rounding is 1/1000."""
     torch.testing.assert_close(score, true, atol=3e-3, rtol=0)
@@ -42,7 +46,10 @@ def test_it_finds_the_planes_and_scores_that_torch_finds(
     views: list[SmallView], others: tuple[int, ...], radius: int
 ) -> None:
     beside = [views[k] for k in others]
-    found, true = best_planes(views[2], beside, Z, radius), best_planes_reference(views[2], beside, Z, radius)
+    found, true = (
+        best_planes(views[2], beside, Z, windows(radius)),
+        best_planes_reference(views[2], beside, Z, windows(radius)),
+    )
     assert_like(found.score, true.score, views[2])
     same, textured = found.plane == true.plane, plane_sweep._variance(views[2], radius)[0, 0] > 1e-3
     assert same[textured].float().mean() > 0.99
@@ -56,13 +63,13 @@ def test_it_finds_the_planes_and_scores_that_torch_finds(
 
 def test_images_of_other_sizes_are_compared_and_pixels_outside_them_are_unknown(views: list[SmallView]) -> None:
     cut = replace(views[3], grey=views[3].grey[:, :, :20, :31].contiguous())
-    found, true = best_planes(views[2], [cut], Z, 2), best_planes_reference(views[2], [cut], Z, 2)
+    found, true = best_planes(views[2], [cut], Z, windows(2)), best_planes_reference(views[2], [cut], Z, windows(2))
     assert_like(found.score, true.score, views[2])
     assert (found.score == -1).float().mean() > 0.1
     turned = views[3].T.copy()
     turned[:3] = np.diag([-1.0, 1.0, -1.0]) @ turned[:3]  # facing away
     away = replace(views[3], T=turned)
-    assert (best_planes(views[2], [away], Z, 2).score == -1).all()
+    assert (best_planes(views[2], [away], Z, windows(2)).score == -1).all()
 
 
 def test_the_result_is_the_same_for_any_number_of_threads(views: list[SmallView]) -> None:
@@ -71,7 +78,7 @@ def test_the_result_is_the_same_for_any_number_of_threads(views: list[SmallView]
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            results.append(best_planes(tall[2], tall[3:], Z, 3))
+            results.append(best_planes(tall[2], tall[3:], Z, windows(3)))
     finally:
         torch.set_num_threads(1)
     assert torch.equal(results[0].score, results[1].score)
@@ -84,8 +91,8 @@ def test_every_library_finds_the_same_bits(
     library = library_for(views[2].grey)
     assert library is not None
     assert library.variant == variant
-    found = best_planes(views[2], views[3:], Z, 3)
+    found = best_planes(views[2], views[3:], Z, windows(3))
     monkeypatch.setenv("GS2D_CPU_VARIANT", available_variants()[-1])
-    other = best_planes(views[2], views[3:], Z, 3)
+    other = best_planes(views[2], views[3:], Z, windows(3))
     for name in ("score", "plane", "before", "after"):
         assert torch.equal(getattr(found, name), getattr(other, name))

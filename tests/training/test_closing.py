@@ -9,6 +9,7 @@ import pytest
 
 from gs2d.config.robust import DenseStart
 from gs2d.data.scene import Scene, View
+from gs2d.training.start import plane_sweep
 from gs2d.training.start.closing import closed_depth, enclosed
 from gs2d.training.start.plane_sweep import sweep_views
 from gs2d.training.start.start_points import start_points
@@ -71,6 +72,7 @@ def in_patch(points: np.ndarray) -> np.ndarray:
 
 
 def test_points_start_on_a_bare_part_of_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plane_sweep, "WIDE_WINDOWS", plane_sweep.FINE_WINDOWS)  # those would reach the texture
     scene, settings = patched(), DenseStart(side=48, min_angle=1.0, cell=2.0)
     sweep = sweep_views(scene, settings)
     found = in_patch(start_points(scene, sweep, settings).points)

@@ -23,10 +23,10 @@ from gs2d.core.spill import Spilled
 from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.kernels.sweep import BestPlanes, sweep_planes
+from gs2d.losses.formulas import flatness
 from gs2d.training.start.sweep_range import SweepRange, sweep_range
 
 PLANES = 64  # depths that are tried for each pixel
-RADIUS = 3  # px: patches of 7x7 pixels are compared
 MIN_NCC = 0.5  # depths with a lower NCC are unknown
 AGREE = 0.02  # depths of two views agree when they differ by at most this fraction
 VOTES = 2  # neighbours that must agree on the depth of a splat
@@ -35,8 +35,6 @@ MIN_POINTS = 20  # sparse points of a view, below which it is not swept
 NEAREST = 2  # percentile of depth that counts as the nearest, because a few sparse points are wrong
 MIN_SHARED = 8  # sparse points that neighbours must share
 NEAR_MARGIN, FAR_MARGIN = 0.8, 1.5  # factors of the 1st and 99th percentile of depth: limits of the sweep
-NOISE = 1e-4  # variance of grey values, [0, 1]^2, added to both variances of the NCC
-MIN_TEXTURE = 2e-5  # variance of a patch below which every depth fits
 GREY = (0.3, 0.6, 0.1)
 BEST_ANGLE, NARROW, WIDE = 10.0, 4.0, 12.0  # degrees: preferred angle of neighbours, and its tolerances
 TRIM_EVERY = 8  # views between returns of freed memory, which would add up to 2 GB for 292 images
@@ -44,6 +42,30 @@ PLANES_AT_ONCE = 16  # 5 MB for each intermediate tensor at 200 px
 SWEEP_BYTES = 1 << 30  # limit for each of downscaled views, depths and free space; the rest goes to the disk
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The patches that are compared.
+
+    Attributes
+    ----------
+    radius : int, px
+        Patches have 2 radius + 1 pixels a side.
+    noise : float
+        Variance of grey values, [0, 1]^2, added to both variances of the NCC.
+    texture : float
+        Variance of a patch below which every depth fits.
+    """
+
+    radius: int
+    noise: float
+    texture: float
+
+
+FINE_WINDOWS = Windows(3, 1e-4, 2e-5)
+WIDE_WINDOWS = Windows(7, 1e-5, 2e-6)  # for bare pixels, where only faint shading tells the depth
+BARE = 127  # flatness, 0 to 255, of these
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,29 +277,39 @@ def _depths(views: Sequence[SmallView], index: int, neighbours: Sequence[int]) -
         return np.zeros((height, width)), np.zeros((height, width), dtype=np.float32)
     step = (1 / view.near - 1 / view.far) / (PLANES - 1)
     z = (1 / (1 / view.far + step * torch.arange(PLANES, dtype=torch.float64))).float()  # far to near
-    best = best_planes(view, [views[other] for other in neighbours], z, RADIUS)
-    bend = best.before - 2 * best.score + best.after
-    shift = torch.where(bend < -1e-6, 0.5 * (best.before - best.after) / bend, torch.zeros_like(bend)).clamp(-0.5, 0.5)
-    depth = 1 / (1 / view.far + step * (best.plane + shift).double())
-    valid = (best.score >= MIN_NCC) & (best.plane > 0) & (best.plane < PLANES - 1)
-    valid &= (_variance(view, RADIUS)[0, 0] >= MIN_TEXTURE) & torch.from_numpy(view.usable)
-    return torch.where(valid, depth, torch.zeros_like(depth)).numpy(), best.score.numpy()
+    others = [views[other] for other in neighbours]
+
+    def swept(windows: Windows) -> tuple[Tensor, Tensor]:
+        best = best_planes(view, others, z, windows)
+        bend = best.before - 2 * best.score + best.after
+        shift = torch.where(bend < -1e-6, 0.5 * (best.before - best.after) / bend, torch.zeros_like(bend))
+        depth = 1 / (1 / view.far + step * (best.plane + shift.clamp(-0.5, 0.5)).double())
+        valid = (best.score >= MIN_NCC) & (best.plane > 0) & (best.plane < PLANES - 1)
+        valid &= (_variance(view, windows.radius)[0, 0] >= windows.texture) & torch.from_numpy(view.usable)
+        return torch.where(valid, depth, torch.zeros_like(depth)), best.score
+
+    depth, score = swept(FINE_WINDOWS)
+    bare = (flatness(view.color.permute(1, 2, 0)) > BARE) & (depth == 0)
+    if bare.any():
+        wide = swept(WIDE_WINDOWS)
+        depth, score = (torch.where(bare, a, b) for a, b in zip(wide, (depth, score), strict=True))
+    return depth.numpy(), score.numpy()
 
 
-def best_planes(view: SmallView, others: Sequence[SmallView], z: Tensor, radius: int) -> BestPlanes:
+def best_planes(view: SmallView, others: Sequence[SmallView], z: Tensor, windows: Windows) -> BestPlanes:
     """Compare a view with others at depths z [D], natively if possible, else in torch."""
     pairs = [_homography(view, other) for other in others]
     turned, moved = (torch.stack([pair[k] for pair in pairs]).float() for k in (0, 1))
     grey = [other.grey[0, 0] for other in others]
     usable = torch.from_numpy(view.usable)
-    found = sweep_planes(view.grey[0, 0], usable, grey, turned, moved, z, radius=radius, noise=NOISE)
-    return found or best_planes_reference(view, others, z, radius)
+    found = sweep_planes(view.grey[0, 0], usable, grey, turned, moved, z, radius=windows.radius, noise=windows.noise)
+    return found or best_planes_reference(view, others, z, windows)
 
 
-def best_planes_reference(view: SmallView, others: Sequence[SmallView], z: Tensor, radius: int) -> BestPlanes:
+def best_planes_reference(view: SmallView, others: Sequence[SmallView], z: Tensor, windows: Windows) -> BestPlanes:
     """Compare a view with others at depths z [D] in torch."""
-    variance = _variance(view, radius)
-    each = [_ncc(view, other, z, variance, radius) for other in others]
+    variance = _variance(view, windows.radius)
+    each = [_ncc(view, other, z, variance, windows) for other in others]
     score = torch.stack(each).topk(min(2, len(each)), dim=0).values.mean(dim=0)  # [D, H, W]
     best, plane = score.max(dim=0)
     inner = plane.clamp(1, len(z) - 2)
@@ -297,14 +329,14 @@ def _homography(view: SmallView, other: SmallView) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(turned), torch.from_numpy(other.K @ motion[:3, 3])
 
 
-def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, radius: int) -> Tensor:
+def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, windows: Windows) -> Tensor:
     """Return the NCC [D, H, W] of patches of a view and another one at depths z [D]; -1 outside the other."""
     (height, width), (rows, columns) = view.size, other.size
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1).double()
     matrix, shift = _homography(view, other)
     turned, moved = (matrix @ pixels).float(), shift.float()  # [3, HW], [3]
-    mine = _blurred(view.grey, radius)
+    radius, mine = windows.radius, _blurred(view.grey, windows.radius)
 
     def at_depths(some: Tensor) -> Tensor:
         seen = turned[:, None, :] * some[None, :, None] + moved[:, None, None]  # [3, D, HW]
@@ -316,7 +348,7 @@ def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, radius:
         mean = _blurred(fetched, radius)
         spread = (_blurred(fetched * fetched, radius) - mean * mean).clamp_min(0)
         common = _blurred(fetched * view.grey, radius) - mean * mine
-        ncc = common / ((spread + NOISE) * (variance + NOISE)).sqrt()
+        ncc = common / ((spread + windows.noise) * (variance + windows.noise)).sqrt()
         return torch.where(inside.reshape(len(some), height, width), ncc[:, 0], torch.full((), -1.0))
 
     return torch.cat([at_depths(some) for some in z.split(PLANES_AT_ONCE)])

@@ -17,10 +17,9 @@ from gs2d.data.scene import PointCloud, Scene
 from gs2d.errors import DataError
 from gs2d.losses.formulas import flatness
 from gs2d.training.start.closing import closed_depth, enclosed
-from gs2d.training.start.plane_sweep import SWEEP_BYTES, SmallView, Sweep, project, unproject
+from gs2d.training.start.plane_sweep import BARE, SWEEP_BYTES, SmallView, Sweep, project, unproject
 
 WAITING = 500_000  # points that are collected before they are thinned
-BARE = 127  # flatness, 0 to 255, of pixels whose depth is interpolated
 MARGIN = 5.0  # px between them and known ones: small gaps close by themselves, and dark recesses are often narrow
 CLOSED_AGREE = 0.03  # interpolated depths of two views agree when they differ by at most this fraction
 CLOSED_CELL = 2.0  # cells of swept points: interpolated ones are sparser, since they have no detail
