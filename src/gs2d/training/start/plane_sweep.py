@@ -289,8 +289,12 @@ def _depths(views: Sequence[SmallView], index: int, neighbours: Sequence[int]) -
         return torch.where(valid, depth, torch.zeros_like(depth)), best.score
 
     depth, score = swept(FINE_WINDOWS)
-    bare = (flatness(view.color.permute(1, 2, 0)) > BARE) & (depth == 0)
-    if bare.any():
+    edges = (flatness(view.color.permute(1, 2, 0)) <= BARE).float()[None, None]
+    # Windows without edges: at an outline, the sky would get the depth of the roof.
+    radius = WIDE_WINDOWS.radius
+    bare = F.max_pool2d(edges, 2 * radius + 1, 1, radius)[0, 0] == 0
+    bare &= (depth == 0) & torch.from_numpy(view.usable)
+    if bare.any() and min(view.size) > radius:
         wide = swept(WIDE_WINDOWS)
         depth, score = (torch.where(bare, a, b) for a, b in zip(wide, (depth, score), strict=True))
     return depth.numpy(), score.numpy()
