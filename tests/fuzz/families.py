@@ -410,7 +410,7 @@ def _checkpoint(root: Path) -> None:
 
     splats = some_splats(5)
     state = {"splats": dict(splats.items()), "queue": [1, 2], "generator": torch.Generator().get_state()}
-    save_tensors(root / "0-surface-0000004.pt", {"state": state, "key": "a" * 64, "events_bytes": 10, "extra": "{}"})
+    save_tensors(root / "0-surface-0000004.pt", {"state": state, "key": "a" * 64, "events_bytes": 10, "seconds": 1.0})
 
 
 def read_checkpoint(root: Path) -> None:

@@ -23,7 +23,6 @@ LATER = {  # steps after training, with the result that is missing if they fail
     "train.stage_results.write_appearance": "refined cameras and exposures",
     "train.stage_results.score_views": "scores of train views, stage refine",
     "train.stage_results.split_metrics": "scores of train views, stage refine",
-    "train.stage_results.report_losses": "reports of the losses, stage refine",
     "train.stage_results.draw_stage": "images of stage refine",
     "train.stage_results.StageScored": "scores of stage refine",
     "finish.run_mesh.fusion_frame": "mesh.ply",

@@ -87,8 +87,8 @@ def half(tensor: torch.Tensor) -> torch.Tensor:
         (("state", "format"), lambda _: 2),
         (("state",), lambda _: [1, 2]),
         (("events_bytes",), lambda _: -5),
-        (("extra",), lambda _: '{"seconds": NaN, "peak_memory": 0}'),
-        (("extra",), lambda _: "[" * 100_000),
+        (("seconds",), lambda _: float("nan")),
+        (("seconds",), lambda _: "[" * 100_000),
         (("state", "learned"), lambda _: {"exposure": {"values": torch.zeros(6, 3, 4)}}),
     ],
 )

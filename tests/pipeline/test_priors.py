@@ -63,24 +63,10 @@ def run(valid: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return train(knowing(valid, tmp_path_factory.mktemp("runs") / "known"))
 
 
-def test_a_run_with_priors_logs_and_reports_them(run: RunFolder) -> None:
+def test_a_run_with_priors_logs_their_losses(run: RunFolder) -> None:
     logged = [line["losses"] for line in run.events.read() if line["kind"] == "progress"]
     assert any(losses.get("depth_prior", 0) > 0 for losses in logged)
     assert any(losses.get("normal_prior", 0) > 0 for losses in logged)
-    for stage in run.metrics()["stages"]:
-        depth, normal = stage["losses"]["depth_prior"], stage["losses"]["normal_prior"]
-        assert 0 < depth["median"] < 100
-        assert 0 < normal["median"] < 180
-        assert len(depth["by_view"]) == 6
-        for said in (depth, normal):
-            assert [view["name"] for view in said["shown"]] == [f"train/r_{k}.png" for k in (1, 3, 5)]
-    drawn = sorted(path.name for path in (run.path / "renders" / "losses").iterdir())
-    kinds = ("depth_prior.1", "depth_prior.2", "normal_prior.1", "normal_prior.2")
-    assert drawn == [f"train__r_{k}.{kind}.png" for k in (1, 3, 5) for kind in kinds]
-    report = " ".join(run.file(REPORT).read_text().split())
-    assert "Known depths" in report
-    assert "relative error of depth, %" in report
-    assert "rendered normals" in report
 
 
 def test_a_run_resumes_only_with_the_same_maps(valid: Path, tmp_path: Path) -> None:
@@ -106,7 +92,8 @@ def test_relative_maps_without_points_are_fitted_to_renderings(valid: Path, tmp_
     made = knowing(valid, tmp_path / "run", depth_prior=source, normal_prior=False, recipe="2dgs")
     found = train(made, lambda event: said.append(event.text) if isinstance(event, Notice) else None)
     assert any("depth prior (relative): 6 of 6" in text for text in said)
-    assert found.metrics()["stages"][-1]["losses"]["depth_prior"]["median"] >= 0
+    logged = [line["losses"]["depth_prior"] for line in found.events.read() if line["kind"] == "progress"]
+    assert max(logged) > 0
 
 
 def test_a_broken_map_is_an_error_before_training_and_leaves_nothing(valid: Path, tmp_path: Path) -> None:
@@ -131,7 +118,7 @@ def test_depth_maps_work_with_file_names_that_are_not_utf_8(valid: Path, tmp_pat
     meta["frames"][0]["file_path"] = f"./train/{name}"
     file.write_text(json.dumps(meta))
     heard: list[Event] = []
-    stages = train(knowing(named, tmp_path / "run"), heard.append).metrics()["stages"]
-    assert len(stages[-1]["losses"]["depth_prior"]["by_view"]) == 6
+    train(knowing(named, tmp_path / "run"), heard.append)
+    assert any(isinstance(event, Notice) and "(sensor): 6 of 6" in event.text for event in heard)
     assert (tmp_path / "run" / REPORT).exists()
     assert not any(isinstance(event, NotMade) for event in heard)

@@ -15,7 +15,6 @@ from gs2d.config.densify import Densify
 from gs2d.data.camera_models import CameraModel
 from gs2d.errors import DivergedError
 from gs2d.io.gaussians import Gaussians
-from gs2d.losses.base import LossReport
 from gs2d.meshing.extract import extract
 from gs2d.render.cpu_backend import CpuBackend
 from gs2d.training.actions.entry_action import EntryAction
@@ -42,19 +41,11 @@ def outside(output, view):
 class Brightness(gs2d.Loss):
     """Compare the mean brightness with that of the photograph, computed once before training."""
 
-    title = "Brightness of the photographs"
-    figure = "error of brightness, levels of 255"
-
     def prepare(self, scene, recipe, device):
         self.means = [torch.tensor(view.image()[..., :3].mean() / 255, device=device) for view in scene.train]
 
     def __call__(self, output, view):
         return (output.color.mean() - self.means[view.index]).square()
-
-    def report(self, output, view):
-        error = 255 * (output.color.mean() - self.means[view.index]).abs()
-        images = {"photograph": view.target, "rendered": output.color}
-        return LossReport(float(error), {title: image.cpu().numpy() for title, image in images.items()})
 
 
 @gs2d.register_reader("example-link")

@@ -50,7 +50,6 @@ from gs2d.io.run_schema import DEFINITION_SHAPE, METRICS_SHAPE, check_shape
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS, SURFACE, EDITS = "checkpoints", "renders", "surface", "edits"
-LOSSES = "losses"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
 POSES, LEARNED, SUBJECT, VERDICT = "poses.json", "learned.json", "subject.json", "verdict.json"
 GEOREFERENCE = "georeference.json"

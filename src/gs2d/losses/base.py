@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,7 +33,6 @@ from gs2d.render.types import RenderOutput
 __all__ = [
     "LOSSES",
     "Loss",
-    "LossReport",
     "LossView",
     "Losses",
     "compute_losses",
@@ -116,23 +114,6 @@ class LossView:
             raise ShapeError(f"camera is {camera.width}x{camera.height}, but the image is {sizes['W']}x{sizes['H']}")
 
 
-@dataclass(frozen=True, eq=False)
-class LossReport:
-    """Report of a loss on a training view after a stage, for ``metrics.json`` and the report.
-
-    Attributes
-    ----------
-    figure : float or None
-        Compared over the views: the report gives the median, and plots it by image.
-    images : mapping of title to array
-        Shown for a few views: colours [H, W, 3] in [0, 1], or depths [H, W] in world units, 0 = unknown, which share
-        one scale.
-    """
-
-    figure: float | None = None
-    images: Mapping[str, np.ndarray] = field(default_factory=dict)
-
-
 class Loss:
     """Base class of losses. A loss is made once for each kind and options of a recipe.
 
@@ -148,15 +129,11 @@ class Loss:
     only_color : bool
         Whether the loss reads nothing of the rendering but ``color``. Stages that only train colours can then render
         from cached views.
-    title, figure : str
-        Heading of the section in the report, "" for no section, and what its figure is: "error of depth, %".
     """
 
     needs: frozenset[str] = frozenset()
     settings: str | None = None
     only_color: bool = False
-    title: str = ""
-    figure: str = ""
 
     def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
         """Get ready for a scene before training begins; raise a Gs2dError if the scene lacks what is needed."""
@@ -184,10 +161,6 @@ class Loss:
         mapping or None
             Fields of ``render.whole_step.StepLosses``; None if such an iteration cannot have this loss.
         """
-        return None
-
-    def report(self, output: RenderOutput, view: LossView) -> LossReport | None:
-        """Return the report on a view; None if there is none."""
         return None
 
 
@@ -254,13 +227,6 @@ class Losses:
     def needing(self, need: str, terms: Sequence[LossTerm]) -> list[LossTerm]:
         """Return the terms whose loss needs an entry of ``gs2d.config.loss_registry.NEEDS``."""
         return [term for term in terms if need in self[term].needs]
-
-    @property
-    def reporters(self) -> dict[str, Loss]:
-        """Losses with a section in the report, by name: their kind, with options where one is not enough."""
-        found = {key: loss for key, loss in self._losses.items() if loss.title}
-        kinds = [kind for kind, _ in found]
-        return {kind if kinds.count(kind) == 1 else f"{kind} {given}": loss for (kind, given), loss in found.items()}
 
 
 def _key(term: LossTerm) -> tuple[str, str]:

@@ -16,7 +16,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
-from gs2d.losses.base import LossReport, LossView, compute_losses, losses_of
+from gs2d.losses.base import LossView, compute_losses, losses_of
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -198,17 +198,6 @@ class FullRender:
             flatness=target.flatness,
             target_mean=target.mean,
         )
-
-    @torch.no_grad()
-    def report(
-        self, state: TrainState, index: int, settings: RasterSettings, backend: Backend
-    ) -> dict[str, LossReport]:
-        """Return the reports of the losses on the current rendering of training view ``index``."""
-        camera = self.camera(state, index)
-        output = rasterize(self.drawn(state.splats), camera, settings, backend=backend)
-        view = self._compared(index, camera, self.targets[index])
-        reports = {name: loss.report(output, view) for name, loss in self.losses.reporters.items()}
-        return {name: report for name, report in reports.items() if report is not None}
 
     def differentiate(self, state: TrainState, stage: Stage, iteration: int, rendered: Rendered) -> StepResult:
         """Return the weighted losses of a rendered view, and the gradients of the leaves that the stage trains.

@@ -21,7 +21,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.cache import ReadAhead
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.losses.base import Loss, LossReport, losses_of
+from gs2d.losses.base import losses_of
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
@@ -203,15 +203,6 @@ class Trainer:
     def done(self) -> bool:
         """Whether every stage is finished."""
         return self.state.stage >= len(self.recipe.stages)
-
-    @property
-    def loss_reporters(self) -> Mapping[str, Loss]:
-        """The losses of the recipe that have a section in the report, by name."""
-        return self._whole.losses.reporters
-
-    def report_losses(self, index: int) -> dict[str, LossReport]:
-        """Return the reports of these losses on the current rendering of training view ``index``."""
-        return self._whole.report(self.state, index, self.settings, self.backend)
 
     def run(self) -> Splats:
         """Train from the current state to the end of the last stage."""

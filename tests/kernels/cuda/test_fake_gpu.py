@@ -95,7 +95,7 @@ tiny.write_ball_mesh(capture / "mesh_gt.ply")
 few = ("init_points=60", "surface.densify.max_splats=90")
 options = TrainOptions(scene=capture, out=folder / "run", backend="cuda", schedule_scale=0.0005, overrides=few)
 last = train(options, lambda event: None).metrics()["stages"][-1]
-print(last["test"]["psnr"] > 5, last["peak_gpu_memory_bytes"] > 0)
+print(last["test"]["psnr"] > 5)
 launched.clear()
 print(mesh_run(folder / "run")["fused_by"], launched["fuse_voxels"] > 0)
 print(evaluate_run(folder / "run")["surface"]["chamfer"] > 0)
@@ -134,4 +134,4 @@ def test_three_stages_train_on_the_device_to_the_same_bits(
 def test_a_run_is_trained_meshed_scored_and_rendered_on_the_device(
     guard: Path, emulator: emulate.Emulator, tmp_path: Path
 ) -> None:
-    assert said(WHOLE_PATH, guard, emulator, tmp_path) == ["True True", "cuda True", "True", "1"]
+    assert said(WHOLE_PATH, guard, emulator, tmp_path) == ["True", "cuda True", "True", "1"]

@@ -22,9 +22,8 @@ from gs2d.io.run_dir import SPLATS, RunFolder, is_run, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
-from gs2d.pipeline.finish.run_mesh import MeshFrames
 from gs2d.pipeline.finish.run_verdict import Collector
-from gs2d.pipeline.finish.scoring import PeakMemory, ScoreOptions, score_views, split_metrics
+from gs2d.pipeline.finish.scoring import ScoreOptions, peak_memory, score_views, split_metrics
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import TrainOptions, values
@@ -130,7 +129,7 @@ def merged_run(settled: Settled, options: TrainOptions, scene: Scene) -> LoadedR
 
 def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) -> dict[str, Any]:
     """Score and mesh the merged scene, write page, verdict and report; return its entry of ``metrics.json``."""
-    run, memory = RunFolder(options.out), PeakMemory()
+    run = RunFolder(options.out)
     if not run.file(SPLATS).exists():
         raise RunError(f"{options.out} must have {SPLATS}, found none; run the command again")
     scene = settled.scene
@@ -141,25 +140,24 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
     collected = Collector(scene)
     hold()
-    with MeshFrames(loaded) as frames:
-        for split, views in (("train", seen.train), ("test", seen.test)):
-            scores = score_views(
-                splats,
-                views,
-                loaded.settings,
-                loaded.backend,
-                name=f"scoring {split} views",
-                on_event=on_event,
-                options=ScoreOptions(split=split, visitors=[frames.visit, collected.visit]),
-            )
-            entry |= split_metrics(scores, split)
-        shown = choose_views(seen)
-        with attempted(f"images of {STAGE}", None, on_event):
-            draw_stage(run, loaded, shown, STAGE, splats, None)
-        release(scene)
-        entry["peak_memory_bytes"] = max(entry["peak_memory_bytes"], memory.read())
-        run.write_metrics({"stages": [entry], "surface": None})
-        finish(run, loaded, splats, on_event, frames, collected)
+    for split, views in (("train", seen.train), ("test", seen.test)):
+        scores = score_views(
+            splats,
+            views,
+            loaded.settings,
+            loaded.backend,
+            name=f"scoring {split} views",
+            on_event=on_event,
+            options=ScoreOptions(split=split, visitors=[collected.visit]),
+        )
+        entry |= split_metrics(scores, split)
+    shown = choose_views(seen)
+    with attempted(f"images of {STAGE}", None, on_event):
+        draw_stage(run, loaded, shown, STAGE, splats, None)
+    release(scene)
+    entry["peak_memory_bytes"] = max(entry["peak_memory_bytes"], peak_memory())
+    run.write_metrics({"stages": [entry], "surface": None})
+    finish(run, loaded, splats, on_event, collected)
     return entry
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -94,7 +93,6 @@ def draw_stage(
     stage: str,
     splats: Splats,
     group: Tensor | None,
-    outputs: Mapping[str, RenderOutput] = MappingProxyType({}),
 ) -> None:
     """Write the images of one stage, the photographs, and the index of both.
 
@@ -104,8 +102,6 @@ def draw_stage(
     ----------
     group : Tensor [N] bool or None
         The high-error splats, once they are known.
-    outputs : mapping
-        Existing renderings of these splats, by name of the view.
     """
     folder = run.file(RENDERS)
     for name in ("photos", stage):
@@ -115,7 +111,7 @@ def draw_stage(
     views, background = [], loaded.settings.background
     files = file_names([view for _, view in shown])
     for (split, view), file in zip(shown, files, strict=True):
-        output = outputs.get(view.name) or render_view(splats, view, loaded.settings, loaded.backend)
+        output = render_view(splats, view, loaded.settings, loaded.backend)
         depth = output.depth(loaded.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
         # All stages use the limits of the first, so that they can be compared.

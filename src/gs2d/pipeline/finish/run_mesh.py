@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 import torch
 
-from gs2d.core.atomic_files import disk_error, is_full
+from gs2d.core.atomic_files import disk_error
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
@@ -21,7 +20,6 @@ from gs2d.data import View
 from gs2d.data.reach import Reach
 from gs2d.data.subject_box import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError, RunError
-from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.meshes import write_mesh, write_pieces
 from gs2d.io.run_dir import (
     MESH,
@@ -31,7 +29,7 @@ from gs2d.io.run_dir import (
     RunFolder,
 )
 from gs2d.meshing.convex_pieces import convex_pieces, required
-from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
+from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.extract import Extraction, ExtractOptions
 from gs2d.meshing.mesh_methods import MESH_METHODS, method_name
 from gs2d.meshing.simplify import simplify
@@ -41,11 +39,10 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_refine import refined
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
-from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, within_reach
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.limits import release, release_buffers
-from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene, checked_output, open_finished
+from gs2d.pipeline.prepare.loaded import RenderedScene, checked_output, open_finished
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
@@ -65,42 +62,6 @@ COARSER_ERROR = 4.0  # times that of the level of detail before: about a quarter
 COARSER = 3  # attempts with larger voxels: the first size is an estimate
 
 
-class MeshFrames:
-    """Depth maps of the training views in a temporary file, collected while the views are scored.
-
-    Pass :meth:`visit` to :func:`~gs2d.pipeline.finish.scoring.score_views`.
-    """
-
-    def __init__(self, loaded: LoadedRun) -> None:
-        self._loaded, self._reach, self._up = loaded, surface_reach(loaded), sky_direction(loaded)
-        self.spool = Spool()
-
-    def visit(self, seen: RenderedPhotograph, scores: ImageMetrics) -> None:
-        """Keep the depth map of a training view; if one is missing, the mesh renders all again."""
-        if seen.split != "train":
-            return
-        try:
-            depth = self._loaded.protocol.fused_depth
-            frame = fusion_frame(self._loaded, seen.view, seen.output, depth, self._reach, self._up)
-            self.spool.append(depth_map(frame))
-        except Exception as error:  # must not prevent the scores; the mesh reports it
-            if is_full(error):
-                raise
-
-    @property
-    def complete(self) -> bool:
-        """Whether every training view was collected."""
-        return len(self.spool) == len(self._loaded.scene.train)
-
-    def __enter__(self) -> MeshFrames:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.spool.close()
-
-
 # -- extraction --------------------------------------------------------------------------------------------------------
 def extract_mesh(
     loaded: RenderedScene,
@@ -110,7 +71,6 @@ def extract_mesh(
     on_event: OnEvent,
     *,
     subject: Subject | None = None,
-    seen: MeshFrames | None = None,
 ) -> dict[str, Any]:
     """Fuse rendered depth of the training views, write the mesh, and return its file, counts and limits.
 
@@ -118,12 +78,10 @@ def extract_mesh(
     ----------
     subject : Subject or None
         Mesh the subject only.
-    seen : MeshFrames, optional
-        Depth maps of these splats; used instead of rendering if they are complete and of the requested kind.
     """
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
-    result = fused(loaded, splats, options, on_event, subject=subject, seen=seen)
+    result = fused(loaded, splats, options, on_event, subject=subject)
     release_buffers()
     cameras, error = [view.camera for view in loaded.scene.train], _error(loaded, options) or ERROR
     coarser = [result.mesh]
@@ -162,7 +120,6 @@ def fused(
     on_event: OnEvent,
     *,
     subject: Subject | None = None,
-    seen: MeshFrames | None = None,
 ) -> Extraction:
     """Fuse rendered depth of the training views; arguments as of :func:`extract_mesh`.
 
@@ -173,27 +130,17 @@ def fused(
     if not len(splats):
         raise ProtocolError("there are no splats to mesh; train longer or check the cameras")
     check_mesh_options(options)
-    depth = options.depth or loaded.protocol.fused_depth
-    usable = seen is not None and seen.complete and depth == loaded.protocol.fused_depth and not options.whole_scene
-
-    def frames() -> Iterable[RenderedView] | Spool:
-        if seen is not None and usable:
-            return seen.spool
-        return _frames(loaded, splats, depth, on_event, whole=options.whole_scene)
-
     free = options.voxel is None and loaded.protocol.fusion.voxel is None
     chosen = options
     for attempt in range(COARSER * free + 1):
         try:
-            result = _extract(loaded, frames(), chosen, on_event, subject)
+            result = _extract(loaded, splats, chosen, on_event, subject)
             break
         except VolumeTooLargeError as error:
             if attempt == COARSER * free:
                 raise
             on_event(Notice(f"{error}; using voxels of this size (more --memory allows smaller ones)"))
             chosen = replace(chosen, voxel=error.voxel)
-    if seen is not None:
-        seen.spool.close()  # frees disk space
     bounded = MESH_METHODS.get(_method_name(options)).bounded
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         part = f"{result.limits.cut_fraction:.0%} of the depth is"
@@ -236,11 +183,7 @@ def check_mesh_options(options: MeshOptions) -> None:
 
 
 def _extract(
-    loaded: RenderedScene,
-    frames: Iterable[RenderedView] | Spool,
-    options: MeshOptions,
-    on_event: OnEvent,
-    subject: Subject | None,
+    loaded: RenderedScene, splats: Splats, options: MeshOptions, on_event: OnEvent, subject: Subject | None
 ) -> Extraction:
     fusion, budget = loaded.protocol.fusion, memory_budget()
     keep = fusion.clusters if options.keep_components is None else options.keep_components
@@ -249,8 +192,6 @@ def _extract(
     bbox = bbox if subject is None else subject.box
     method = MESH_METHODS.get(_method_name(options))
     own = bbox is not None or not method.bounded
-    if isinstance(frames, Spool):
-        on_event(Phase("fusing", 0))
     chosen = ExtractOptions(
         bbox=bbox,
         voxel=options.voxel if own else options.voxel or fusion.voxel,
@@ -265,6 +206,7 @@ def _extract(
         max_bytes=VOLUME_BYTES if budget is None else budget,
         slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
+    frames = _frames(loaded, splats, options, on_event)
     result: Extraction = method.extract(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface is covered well enough"))
@@ -283,12 +225,11 @@ def _error(loaded: RenderedScene, options: MeshOptions) -> float:
 
 
 # -- depth maps --------------------------------------------------------------------------------------------------------
-def _frames(
-    loaded: RenderedScene, splats: Splats, depth: str, on_event: OnEvent, *, whole: bool
-) -> Iterator[RenderedView]:
-    """Yield the input of fusion for each training view; sky is kept in meshes of the ``whole`` scene."""
+def _frames(loaded: RenderedScene, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Iterator[RenderedView]:
+    """Yield the input of fusion for each training view; meshes of the whole scene keep the sky."""
+    depth = options.depth or loaded.protocol.fused_depth
     views, settings = loaded.scene.train, replace(loaded.settings, with_distortion=False).for_depths(depth)
-    reach, up = surface_reach(loaded), None if whole else sky_direction(loaded)
+    reach, up = surface_reach(loaded), None if options.whole_scene else sky_direction(loaded)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
             output = rasterize(splats, view.camera, settings, backend=loaded.backend)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -155,22 +153,11 @@ def _rendered(
         yield RenderedPhotograph(view, options.split, output, image, target, mask)
 
 
-def split_metrics(
-    scores: dict[str, ImageMetrics], name: str, split: str | None = None, *, of: int | None = None
-) -> dict[str, Any]:
-    """Return ``{name: means}``, or null with the reason if the scene has no views of ``split`` (default: ``name``).
-
-    ``views`` is the number of scored views, if it is below the size ``of`` of the split.
-    """
+def split_metrics(scores: dict[str, ImageMetrics], name: str, split: str | None = None) -> dict[str, Any]:
+    """Return ``{name: means}``, or null with the reason if the scene has no views of ``split`` (default: ``name``)."""
     if not scores:
         return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
-    some = {} if of is None or len(scores) == of else {"views": len(scores)}
-    return {name: {**mean_metrics(list(scores.values())).to_json(), **some}}
-
-
-def is_partial(entry: Mapping[str, Any]) -> bool:
-    """Return whether a stage in ``metrics.json`` was scored on some of its views only."""
-    return any("views" in (entry.get(split) or {}) for split in ("train", "test"))
+    return {name: mean_metrics(list(scores.values())).to_json()}
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
@@ -179,37 +166,9 @@ def evenly(views: Sequence[View], most: int) -> Sequence[View]:
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
-class PeakGpuMemory:
-    """Peak of torch's memory on the GPU since :meth:`reset`; 0 if the backend uses none."""
+def peak_memory() -> int:
+    """Return the peak resident memory of this process, bytes."""
+    import resource
 
-    def __init__(self, backend: Backend) -> None:
-        self._used = torch.device(backend.device).type == "cuda"
-
-    def reset(self) -> None:
-        """Restart from the current allocation."""
-        if self._used:
-            torch.cuda.reset_peak_memory_stats()
-
-    def read(self) -> int:
-        """Return bytes."""
-        return int(torch.cuda.max_memory_allocated()) if self._used else 0
-
-
-class PeakMemory:
-    """Peak resident memory of this process since :meth:`reset` (Linux), or since its start (elsewhere)."""
-
-    def reset(self) -> None:
-        """Restart from the current resident memory."""
-        with contextlib.suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")
-
-    def read(self) -> int:
-        """Return bytes."""
-        with contextlib.suppress(OSError):
-            for line in Path("/proc/self/status").read_text().splitlines():
-                if line.startswith("VmHWM:"):
-                    return int(line.split()[1]) * 1024
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return int(peak if sys.platform == "darwin" else peak * 1024)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak if sys.platform == "darwin" else peak * 1024)

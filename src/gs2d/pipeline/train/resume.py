@@ -35,13 +35,10 @@ class ResumePoint:
         None: from nothing.
     seconds : float
         Training time already spent in the current stage.
-    peak_memory : int
-        Bytes, of the current stage so far.
     """
 
     state: TrainState | None = None
     seconds: float = 0.0
-    peak_memory: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +86,7 @@ def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint
             kept |= {name: metrics[name] for name in ("surface", "mesh") if name in metrics}
         run.write_metrics({"stages": metrics["stages"][:finished], **kept})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
-        extra = json.loads(payload["extra"])
-        return ResumePoint(state, extra["seconds"], extra["peak_memory"])
+        return ResumePoint(state, payload["seconds"])
     raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
 
 
@@ -99,13 +95,11 @@ def _read(path: Path) -> dict[str, Any]:
     """Return the contents of a checkpoint, complete and of the types that ``RunLogger`` writes."""
     payload = load_tensors(path)
     try:
-        size, extra = payload["events_bytes"], json.loads(payload["extra"])
-        seconds, peak = extra["seconds"], extra["peak_memory"]
-        valid = isinstance(size, int) and isinstance(peak, int) and min(size, peak) >= 0
-        valid = valid and isinstance(seconds, int | float) and 0 <= seconds < math.inf
+        size, seconds = payload["events_bytes"], payload["seconds"]
+        valid = isinstance(size, int) and size >= 0 and isinstance(seconds, float) and 0 <= seconds < math.inf
         if not (valid and isinstance(payload["key"], str) and isinstance(payload["state"], dict)):
             raise ValueError("a value of another type")
-    except (LookupError, TypeError, ValueError, RecursionError) as error:
+    except (LookupError, ValueError) as error:
         raise _unreadable(path, f"{type(error).__name__}: {error}") from error
     return payload
 

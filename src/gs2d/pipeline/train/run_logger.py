@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
@@ -13,7 +12,8 @@ from typing import Any
 from gs2d.config.recipe import Stage
 from gs2d.errors import DivergedError, Gs2dError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.finish.scoring import PeakGpuMemory, PeakMemory, Visitor
+from gs2d.pipeline.finish.run_verdict import Collector
+from gs2d.pipeline.finish.scoring import peak_memory
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.resolve import checkpoint_interval
@@ -65,8 +65,8 @@ class RunLogger:
     trainer : Trainer
     start : ResumePoint
     on_event : callable
-    visitors : sequence of Visitor
-        Receive every view of the finished splats while they are scored.
+    collected : Collector or None
+        Measures every view of the finished splats.
     """
 
     def __init__(
@@ -76,14 +76,13 @@ class RunLogger:
         trainer: Trainer,
         start: ResumePoint,
         on_event: OnEvent,
-        visitors: Sequence[Visitor] = (),
+        collected: Collector | None = None,
     ) -> None:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
-        self._results = StageResults(run, loaded, trainer, on_event, visitors)
+        self._results = StageResults(run, loaded, trainer, on_event, collected)
         self._progress_every = progress_every(loaded)
         self._checkpoint_interval = checkpoint_interval(loaded.resolved.execution.checkpoint_every)
-        self._memory, self._gpu_memory = PeakMemory(), PeakGpuMemory(loaded.backend)
-        self._clock, self._peak = StageClock(start.seconds), start.peak_memory
+        self._clock = StageClock(start.seconds)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self.psnr: float | None = None  # of the probe views
         self._signals = HeldSignals()
@@ -142,8 +141,6 @@ class RunLogger:
             return
         if isinstance(event, events.StageEntering):
             self._reset_stage()
-            self._memory.reset()
-            self._gpu_memory.reset()
             self._clock.start()
         elif isinstance(event, events.StageFinished):
             self._clock.stop()
@@ -189,22 +186,17 @@ class RunLogger:
     # -- checkpoints and stages ----------------------------------------------------------------------------------------
     def _save(self, index: int, iteration: int | None) -> None:
         """Write a checkpoint; ``iteration`` None: at the end of the stage."""
-        self._peak = max(self._peak, self._memory.read())
-        extra = {"seconds": self._clock.seconds, "peak_memory": self._peak}
         key = self._loaded.stage_key(index, self._state.processes)
-        payload = {"state": self._state.state_dict(), "extra": json.dumps(extra), "key": key}
+        payload = {"state": self._state.state_dict(), "seconds": self._clock.seconds, "key": key}
         self._run.save_checkpoint(index, self._stage(index).name, iteration, payload)
         self._saved_at, self._saved_iteration = time.perf_counter(), iteration or 0
 
     def _reset_stage(self) -> None:
-        self._clock, self._peak, self._saved_iteration = StageClock(), 0, 0
+        self._clock, self._saved_iteration = StageClock(), 0
 
     def _facts(self) -> dict[str, Any]:
         """Return the entry of a stage in ``metrics.json`` without its scores."""
-        facts: dict[str, Any] = {"seconds": round(self._clock.seconds, 3), "peak_memory_bytes": self._peak}
-        if self._gpu_memory.read():
-            facts["peak_gpu_memory_bytes"] = self._gpu_memory.read()  # before scoring adds to it
-        return facts
+        return {"seconds": round(self._clock.seconds, 3), "peak_memory_bytes": peak_memory()}
 
     def _finish_stage(self, index: int) -> None:
         self._save(index, None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import Any
 
 from gs2d.config.grades import TRANSPARENT
@@ -15,13 +14,11 @@ from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
+from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import (
-    RenderedPhotograph,
     ScoreOptions,
     TransparentPixels,
     Visitor,
-    evenly,
-    is_partial,
     mean_psnr,
     score_views,
     split_metrics,
@@ -30,14 +27,11 @@ from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_appearance import write_appearance
 from gs2d.pipeline.prepare.run_poses import write_poses
-from gs2d.pipeline.train.loss_reports import report_losses
 from gs2d.pipeline.train.resume import put_in_cache
-from gs2d.render.types import RenderOutput
 from gs2d.training.events import Notice, OnEvent, StageScored
 from gs2d.training.trainer import Trainer
 
 PROBE_VIEWS = 4
-EARLY_VIEWS = 16  # training views that score a stage before the last, if the scene has test views
 
 
 class StageResults:
@@ -49,15 +43,15 @@ class StageResults:
     loaded : LoadedRun
     trainer : Trainer
     on_event : callable
-    visitors : sequence of Visitor
-        Receive every view of the finished splats while they are scored.
+    collected : Collector or None
+        Measures every view of the finished splats.
     """
 
     def __init__(
-        self, run: RunFolder, loaded: LoadedRun, trainer: Trainer, on_event: OnEvent, visitors: Sequence[Visitor] = ()
+        self, run: RunFolder, loaded: LoadedRun, trainer: Trainer, on_event: OnEvent, collected: Collector | None
     ) -> None:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
-        self._visitors = visitors
+        self._collected = collected
         self._shown = choose_views(loaded.scene)
         probes = loaded.scene.test or loaded.scene.train
         self._probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
@@ -75,15 +69,15 @@ class StageResults:
             self._score_stage(index, facts)
 
     def take_over(self, index: int, facts: Mapping[str, Any]) -> None:
-        """Draw a stage of another run or process, and score it if its scores are missing or partial."""
+        """Draw a stage of another run or process, and score it if its scores or measures are missing."""
         stages = self._run.metrics()["stages"]
         if self._is_last(index):
             self.write_splats()
-        unseen = bool(self._visitors) and not self._run.file(VERDICT).exists()
+        unseen = self._collected is not None and not self._run.file(VERDICT).exists()
         with self._attempted_at_end(index):
             if len(stages) <= index:
                 self._score_stage(index, facts)
-            elif self._is_last(index) and (unseen or is_partial(stages[-1])):
+            elif self._is_last(index) and unseen:
                 self._score_stage(index, {**facts, **stages[-1]})
             else:
                 self._draw(self._stage(index).name)
@@ -115,29 +109,21 @@ class StageResults:
             "bytes": splats.nbytes,
             **facts,
         }
-        shown = {view.name for _, view in self._shown}
-        outputs: dict[str, RenderOutput] = {}
         transparent = TransparentPixels()
-
-        def keep(seen: RenderedPhotograph, scores: ImageMetrics) -> None:
-            if seen.view.name in shown:
-                outputs[seen.view.name] = seen.output
-
-        for split, views in self._scored(last=last):
+        for split, views in (("train", self._loaded.scene.train), ("test", self._loaded.scene.test)):
             entry |= {split: None, f"{split}_reason": "its views could not be scored"}
             with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
-                visitors = [keep, transparent.visit, *(self._visitors if last else ())]
-                scores = self._score(split, views, f"scoring {split} views", visitors)
+                visitors = [transparent.visit]
+                visitors += [self._collected.visit] if last and self._collected is not None else []
+                scores = self._score(split, views, visitors)
                 del entry[f"{split}_reason"]
-                entry |= split_metrics(scores, split, of=len(self._views(split)))
+                entry |= split_metrics(scores, split)
         entry |= transparent.entry()
         part = entry.get("transparent", {}).get("part", 0.0)
         if last and part > TRANSPARENT:
             text = f"{100 * part:.1f} % of the pixels of training views are transparent (alpha below 0.9)"
             self._on_event(Notice(text, detail=True))
-        with attempted(f"reports of the losses, stage {stage.name}", None, self._on_event):
-            entry |= report_losses(self._run, self._trainer, self._loaded.scene.train)
-        self._draw(stage.name, outputs)
+        self._draw(stage.name)
         stages = [*self._run.metrics()["stages"][:index], entry]
         self._run.write_metrics({"stages": stages, "surface": None})
         cache = self._loaded.resolved.execution.cache
@@ -146,31 +132,19 @@ class StageResults:
             put_in_cache(cache, self._run, index, load_tensors(saved.path))
         self._on_event(StageScored(entry))
 
-    def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
-        """Return the views that score a stage: all, but only some training views before the last stage.
-
-        If stages are compared by training views (DTU, captures without test views), all of them are scored.
-        """
-        scene = self._loaded.scene
-        compared = self._loaded.protocol.test_on == "train" or not scene.test
-        train = scene.train if last or compared else evenly(scene.train, EARLY_VIEWS)
-        return [("train", train), ("test", scene.test)]
-
-    def _score(
-        self, split: str, views: Sequence[View], name: str, visitors: Sequence[Visitor] = ()
-    ) -> dict[str, ImageMetrics]:
+    def _score(self, split: str, views: Sequence[View], visitors: Sequence[Visitor]) -> dict[str, ImageMetrics]:
         views, loaded = self._now(views, self._shown_scene()), self._loaded
         options = ScoreOptions(split=split, visitors=visitors)
-        drawing = (loaded.settings, loaded.backend)
+        drawing, name = (loaded.settings, loaded.backend), f"scoring {split} views"
         return score_views(self._trainer.drawn, views, *drawing, name=name, on_event=self._on_event, options=options)
 
-    def _draw(self, stage: str, outputs: Mapping[str, RenderOutput] = MappingProxyType({})) -> None:
+    def _draw(self, stage: str) -> None:
         drawn, state = self._trainer.drawn, self._trainer.state
         views = self._now([view for _, view in self._shown], self._shown_scene())
         shown = zip((split for split, _ in self._shown), views, strict=True)
         with attempted(f"images of stage {stage}", None, self._on_event):
             group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # no frozen splats
-            draw_stage(self._run, self._loaded, list(shown), stage, drawn, group, outputs)
+            draw_stage(self._run, self._loaded, list(shown), stage, drawn, group)
 
     def _shown_scene(self) -> Scene:
         """Return the scene with its learned appearance, and predicted exposures of its test views."""
@@ -184,9 +158,6 @@ class StageResults:
         """Return the views of ``scene`` that correspond to views of the capture."""
         now = dict(zip(map(id, self._loaded.scene.views), scene.views, strict=True))
         return [now.get(id(view), view) for view in views]
-
-    def _views(self, split: str) -> Sequence[View]:
-        return self._loaded.scene.train if split == "train" else self._loaded.scene.test
 
     def _is_last(self, index: int) -> bool:
         return index == len(self._loaded.recipe.stages) - 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -25,11 +25,10 @@ from gs2d.io.run_dir import (
     remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.finish.run_mesh import MeshFrames, extract_mesh, keep_facts
+from gs2d.pipeline.finish.run_mesh import extract_mesh, keep_facts
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
-from gs2d.pipeline.finish.scoring import Visitor
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
 from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
@@ -140,11 +139,9 @@ def _train(
             release(loaded.scene)
             return run
         collected = Collector(loaded.scene)
-        with MeshFrames(loaded) as frames:
-            visitors = [frames.visit, collected.visit]
-            splats, now = train_stages(run, loaded, start, on_event, visitors, together, live)
-            release(loaded.scene)  # before the volume of the mesh
-            finish(run, replace(loaded, scene=now), splats, on_event, frames, collected)
+        splats, now = train_stages(run, loaded, start, on_event, collected, together, live)
+        release(loaded.scene)  # before the volume of the mesh
+        finish(run, replace(loaded, scene=now), splats, on_event, collected)
     return run
 
 
@@ -183,13 +180,13 @@ def train_stages(
     loaded: LoadedRun,
     start: ResumePoint,
     on_event: OnEvent,
-    visitors: Sequence[Visitor] = (),
+    collected: Collector | None = None,
     together: OneProcess = ONE_PROCESS,
     live: Live | None = None,
 ) -> tuple[Splats, Scene]:
     """Train from ``start`` to the end of the last stage; return the splats and the scene with its refined cameras.
 
-    The splats are written before they are scored. ``visitors`` receive every view of the finished splats.
+    The splats are written before they are scored. ``collected`` measures every view of the finished splats.
     """
     from gs2d.training.trainer import Trainer, TrainerOptions
 
@@ -220,7 +217,7 @@ def train_stages(
             processes=together,
         ),
     )
-    recorder = RunLogger(run, loaded, trainer, start, on_event, visitors)
+    recorder = RunLogger(run, loaded, trainer, start, on_event, collected)
     recorder.begin()
     with recorder.ending_well():
         trainer.run()
@@ -265,21 +262,14 @@ def _estimate_line(loaded: LoadedRun) -> str:
     ).line()
 
 
-def finish(
-    run: RunFolder,
-    loaded: LoadedRun,
-    splats: Splats,
-    on_event: OnEvent,
-    frames: MeshFrames,
-    collected: Collector,
-) -> None:
+def finish(run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent, collected: Collector) -> None:
     """Write mesh, page, verdict and report of a run; a failure of one does not prevent the others."""
     execution = loaded.resolved.execution
     mesh = MeshOptions(subject_box=execution.subject_box, whole_scene=execution.whole_scene)
     with attempted(MESH, again("mesh", run.path), on_event):
         subject = meshed_subject(run, loaded, splats, mesh, on_event)
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
-            keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames))
+            keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject))
     if execution.page and not run.file(PAGE).exists():
         with attempted(PAGE, again("export", run.path, "--format", "html"), on_event):
             page_run(run.path, on_event=on_event, loaded=loaded)

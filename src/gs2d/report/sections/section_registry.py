@@ -14,7 +14,7 @@ Section = Callable[[RunRecord], str | None]
 GLOSSARY = "terms"  # the last section
 _BUILTIN = (  # in the order of the page; each is a module of this package
     *("verdict", "results", "views", "training", "capture"),
-    *("learned", "losses", "files", "settings"),
+    *("learned", "files", "settings"),
 )
 SECTIONS: Registry[Section] = Registry(
     "report section",
