@@ -21,7 +21,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from PIL import Image
@@ -31,8 +31,8 @@ from gs2d.core.json_files import write_json
 from gs2d.core.similarity import apply, similarity_scale, umeyama
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import Gs2dError
-from gs2d.pipeline.prepare.options import PosesOptions
-from gs2d.pipeline.prepare.pose_finding import CAMERA_MODELS, find_poses
+from gs2d.pipeline.prepare.options import LensModel, PosesOptions
+from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.training.events import Notice
 
 LOW, HIGH = np.array([-2.0, -1.6, 0.0]), np.array([2.0, 1.6, 2.4])  # m, size of the room
@@ -237,7 +237,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--off", type=float, default=0.0, help="offset of the circle's centre to the right and down, px"
     )
-    parser.add_argument("--camera-model", choices=("auto", *CAMERA_MODELS), default="auto", help="passed to gs2d poses")
+    parser.add_argument("--camera-model", choices=get_args(LensModel), default="auto", help="passed to gs2d poses")
     parser.add_argument("--tilt", type=float, default=3.0, help="degrees, one sigma")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args(arguments)

@@ -16,7 +16,7 @@ from cli_runs import TINY, one_line, spawn
 from gs2d.cli import app as app_module
 from gs2d.cli import run
 
-NOTHING = "interrupted; nothing was kept, because training had not begun\n"
+RESUME = "interrupted; resume with: gs2d train "
 
 
 def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
@@ -49,9 +49,9 @@ def test_an_internal_error_is_exit_code_1_with_a_traceback_only_for_debug(
     assert run(["evaluate", str(trained)]) == 1
     err = capsys.readouterr().err
     assert err.splitlines() == [
-        "fault in gs2d: ZeroDivisionError: a bug; run again with --debug and report it with the traceback"
+        "fault in gs2d: ZeroDivisionError: a bug; run again with --verbose and report it with the traceback"
     ]
-    assert run(["evaluate", str(trained), "--debug"]) == 1
+    assert run(["evaluate", str(trained), "--verbose"]) == 1
     assert "Traceback" in capsys.readouterr().err
 
 
@@ -108,7 +108,7 @@ def test_a_second_ctrl_c_does_not_interrupt_the_cleanup(
     monkeypatch.setattr(Trainer, "step", lambda _self: os.kill(os.getpid(), signal.SIGINT))
     monkeypatch.setattr(RunFolder, "discard", impatient)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
-    assert capsys.readouterr().err == NOTHING
+    assert one_line(capsys.readouterr().err).startswith(RESUME)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -149,7 +149,7 @@ def test_ctrl_c_before_the_first_iteration_leaves_no_run(
 
     monkeypatch.setattr(Trainer, "step", interrupted)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
-    assert capsys.readouterr().err == NOTHING
+    assert one_line(capsys.readouterr().err).startswith(RESUME)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -144,9 +144,9 @@ def test_its_command_is_listed_parsed_and_run(gs2d: CliProcess, trained: Path) -
 
 
 def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: CliProcess, trained: Path) -> None:
-    """What `gs2d recipes show --json` prints, and what trained the run, are one recipe."""
+    """What `gs2d recipes --json` prints, and what trained the run, are one recipe."""
     file = trained.parent / "mine.json"
-    file.write_text(gs2d("recipes", "show", "example-2dgs", "--json").stdout)
+    file.write_text(gs2d("recipes", "example-2dgs", "--json").stdout)
     few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page")
     chosen = ("--recipe", file, "--backend", "example-checked")
     said = gs2d("train", trained.parent / "link", "--out", trained, *chosen, *few, "--resume")

@@ -78,7 +78,7 @@ def test_a_json_file_is_what_recipes_show_prints(tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text("[]")
     with pytest.raises(RecipeError, match="object"):
         get_recipe(str(tmp_path / "bad.json"))
-    with pytest.raises(RecipeError, match="gs2d recipes show NAME"):
+    with pytest.raises(RecipeError, match="gs2d recipes NAME"):
         get_recipe(str(tmp_path / "none.json"))
     (tmp_path / "bad.json").write_text('{"name": "x"}')
     with pytest.raises(RecipeError, match="recipes"):

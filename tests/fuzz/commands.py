@@ -115,7 +115,7 @@ LINES = (
     "evaluate RUN --mesh-gt a.ply --json",
     "poses PHOTOS --out CAPTURE",
     "sweep A B --recipes 2dgs,2dgs-r --out TABLE",
-    "recipes show 2dgs-r --json",
+    "recipes 2dgs-r --json",
     "view RUN --port 8080",
 )
 

@@ -213,7 +213,7 @@ def test_ctrl_c_during_the_search_keeps_results(room: Room, tmp_path: Path) -> N
     out = tmp_path / "run"
     error_output = interrupt(words_for(room.photos, out), "finding features")
     line = error_output.splitlines()[-1]
-    assert line.startswith("interrupted; the search for cameras is kept; resume with: gs2d reconstruct ")
+    assert line.startswith("interrupted; resume with: gs2d reconstruct ")
     assert error_output.splitlines()[-1].endswith(" --resume")
     assert [path.name for path in out.iterdir()] == [".capture.poses"]
     heard: list[Event] = []

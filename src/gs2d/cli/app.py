@@ -26,7 +26,6 @@ from gs2d.cli.commands import (
     DoctorCommand,
     InfoCommand,
     RecipesCommand,
-    ReconstructCommand,
     TrainCommand,
 )
 from gs2d.cli.console import Console, show_help
@@ -85,7 +84,7 @@ def run(argv: Sequence[str]) -> int:
         console.close()
         if getattr(error, "told", False):  # contact to another process was lost, and that process reports the reason
             return EXIT_USAGE
-        return _report(error, command.debug)
+        return _report(error, command.verbose)
 
 
 def execute(command: Common, console: Console) -> None:
@@ -107,7 +106,7 @@ def leave(code: int) -> NoReturn:
             sys.stdout.flush()
     except OSError as error:
         _drop_stdout()
-        code = PIPE_CLOSED if isinstance(error, BrokenPipeError) else code or _report(error, debug=False)
+        code = PIPE_CLOSED if isinstance(error, BrokenPipeError) else code or _report(error, verbose=False)
     if code and os.environ.get("WORLD_SIZE", "1") != "1":  # threads may still talk to processes that have ended
         os._exit(code)
     sys.exit(code)
@@ -125,7 +124,7 @@ def _help_or_version(argv: Sequence[str]) -> list[str] | None:
 
     words = list(argv)
     if not words:
-        return helps.first_day()
+        return helps.program_help()
     if words[0] == "help":
         words = [*words[1:], "--help"]
     if "--version" in words or words[0] in ("version", "-V"):
@@ -167,9 +166,9 @@ def _print_traceback(error: BaseException) -> None:
     print(printable("".join(traceback.format_exception(error)), lines=True), end="", file=sys.stderr)
 
 
-def _report(error: Exception, debug: bool) -> int:
+def _report(error: Exception, verbose: bool) -> int:
     """Print an error and return its exit code."""
-    if debug:
+    if verbose:
         _print_traceback(error)
     if isinstance(error, Gs2dError):
         return _fail(str(error))
@@ -184,7 +183,7 @@ def _report(error: Exception, debug: bool) -> int:
             return _fail("cannot start more threads or processes; raise ulimit -u, or use fewer --threads")
         return _fail("out of memory; use a larger --downscale, or fewer splats (--set STAGE.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
-    hint = "" if debug else "; run again with --debug and report it with the traceback"
+    hint = "" if verbose else "; run again with --verbose and report it with the traceback"
     _print_error(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}")
     return EXIT_BUG
 
@@ -192,7 +191,7 @@ def _report(error: Exception, debug: bool) -> int:
 def _report_missing(console: Console, argv: Sequence[str], command: Common) -> int:
     """Print what a finished command could not write and the command that writes it; return the exit code."""
     for event in console.missing:
-        if command.debug and event.error is not None:
+        if command.verbose and event.error is not None:
             _print_traceback(event.error)
         line = f"not made: {event.what}"
         if console.quiet:  # the reason was not printed
@@ -209,26 +208,7 @@ def _resumed(argv: Sequence[str]) -> str:
 
 
 def _interrupted(argv: Sequence[str], command: Common) -> int:
-    """Print what is kept of an interrupted command and how to continue it."""
-    line = "interrupted"
-    if isinstance(command, HowItRuns):
-        is_training = any((command.out / "checkpoints").glob("*.pt"))
-        if is_training or isinstance(command, ReconstructCommand):  # which can always resume
-            line += f"; {'' if is_training else _kept_cameras(command)}resume with: {_resumed(argv)}"
-        else:
-            line += "; nothing was kept, because training had not begun"
+    """Print how to continue an interrupted command."""
+    line = f"interrupted; resume with: {_resumed(argv)}" if isinstance(command, HowItRuns) else "interrupted"
     print(printable(line + command.after_interrupt(argv)), file=sys.stderr)
     return INTERRUPTED
-
-
-def _kept_cameras(command: HowItRuns) -> str:
-    """Return what an interrupted ``gs2d reconstruct`` keeps before training, in words."""
-    from gs2d.sfm.search import SEARCH
-    from gs2d.sfm.workspace import hidden_workspace
-
-    capture = command.out / "capture"
-    if capture.exists():
-        return "the cameras are kept; "
-    if (hidden_workspace(capture) / SEARCH).exists():
-        return "the search for cameras is kept; "
-    return "nothing was kept, as no camera was found; "

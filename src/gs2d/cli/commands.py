@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from gs2d.cli.command_registry import BEGIN, LOOK, MEASURE, STEPS, register_command
 from gs2d.config.arguments import SETTING, Arg
@@ -14,7 +14,6 @@ from gs2d.pipeline.prepare.options import (
     EditOptions,
     EvaluateOptions,
     MeshOptions,
-    Overrides,
     PosesOptions,
     ReconstructOptions,
     RenderOptions,
@@ -33,11 +32,9 @@ class Common:
     quiet: bool = False
     """Print errors only."""
     verbose: bool = False
-    """Print every decision. Without it, most are only in events.jsonl."""
+    """Print every decision, and the traceback of an error. Without it, most decisions are only in events.jsonl."""
     json: bool = False
     """Print the result as JSON on stdout."""
-    debug: bool = False
-    """Print the traceback of an error."""
 
     def after_interrupt(self, words: Sequence[str]) -> str:
         """Return what to say after Ctrl-C, beyond "interrupted"; ``words`` is the command line."""
@@ -188,18 +185,10 @@ class EditCommand(EditOptions, Common):
 @register_command("recipes", action="gs2d.cli.handlers:recipes", group=MEASURE)
 @dataclass(frozen=True, kw_only=True)
 class RecipesCommand(Common):
-    """List recipes, or print one as JSON: `gs2d recipes show NAME`."""
+    """List recipes, or print one as JSON."""
 
-    action: Annotated[Literal["list", "show"], Arg(positional=True)] = "list"
-    """Action."""
     name: Annotated[str, Arg(positional=True)] = ""
-    """Name of the recipe to show."""
-    all: bool = False
-    """List all recipes, not only the three for everyday use."""
-    schedule_scale: float = 1.0
-    """Fraction of the iterations of the recipe."""
-    overrides: Overrides = ()
-    """Change the recipe, as in `gs2d train`; may be repeated."""
+    """Recipe to print."""
 
 
 @register_command("doctor", action="gs2d.cli.doctor:doctor", group=BEGIN)

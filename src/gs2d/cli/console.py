@@ -137,19 +137,15 @@ class Console:
         if sys.stdout is not None:
             sys.stdout.flush()
 
-    def say(self, text: str) -> None:
+    def say(self, text: str, style: str | None = None) -> None:
         """Print a line on stdout."""
+        self.close()
         if not (self.quiet or self.as_json):
-            self._out.print(text, markup=False)
-
-    def heading(self, text: str) -> None:
-        """Print an empty line and a heading on stdout."""
-        if not (self.quiet or self.as_json):
-            self._out.print()
-            self._out.print(text, markup=False, style="bold")
+            self._out.print(text, markup=False, style=style)
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print a table on stdout; the first column is text, the others are numbers."""
+        self.close()
         if self.quiet or self.as_json:
             return
         table = Table(title=escape(title) or None, title_justify="left", box=None, pad_edge=False)
@@ -163,6 +159,7 @@ class Console:
 
     def result(self, value: Any) -> None:
         """Print the result as JSON on stdout, with ``as_json``."""
+        self.close()
         if self.as_json:
             if self.missing and isinstance(value, dict):
                 value = {**value, "missing": [{"what": m.what, "reason": m.reason} for m in self.missing]}

@@ -33,10 +33,10 @@ def doctor(_command: DoctorCommand, console: Console) -> None:
     optional = _optional()
     console.say(f"{host['processor']}, {host['cores']} cores, {host['system']}")
     console.say(", ".join(f"{name} {version}" for name, version in installed.items()))
-    console.heading(f"Rasterizers (--backend auto takes: {chosen})")
+    console.say(f"\nRasterizers (--backend auto takes: {chosen})", style="bold")
     for status in backends:
         _show(console, status.name, status.available, status.details or status.reason, status.remedy)
-    console.heading("For some commands")
+    console.say("\nFor some commands", style="bold")
     for entry in optional.values():
         _show(console, entry["used_by"], entry["available"], entry["details"], entry["remedy"])
     fields = ("name", "available", "reason", "remedy", "details")

@@ -11,10 +11,10 @@ from gs2d.cli import commands as c
 from gs2d.cli.console import Console
 from gs2d.cli.results import score_rows, show_run, show_surface
 from gs2d.core.processes import process_rank
-from gs2d.errors import ProtocolError, RecipeError, RunError
+from gs2d.errors import ProtocolError, RunError
 from gs2d.pipeline.prepare.options import EditOptions, MeshOptions, TextureOptions, values
 
-EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows without --all
+EVERYDAY = ("best", "best-fast", "2dgs")  # listed first
 
 
 def _keep_to(gib: float | None) -> None:
@@ -29,7 +29,6 @@ def train(command: c.TrainCommand, console: Console) -> None:
     from gs2d.pipeline.train.train_run import train as run_training
 
     run = run_training(command, console.on_event)
-    console.close()
     if process_rank().leads:  # one process of several prints
         show_run(run.path, run.metrics(), console)
 
@@ -55,7 +54,6 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
         result = mesh_file(command.splats, options, console.on_event, out=out, cameras=command.cameras, threads=threads)
     else:
         raise RunError("expected the folder of a run, got none; name one, or give --splats FILE --out MESH")
-    console.close()
     console.say(f"{result['file']}: {result['vertices']:,} vertices, {result['faces']:,} triangles")
     if "voxel" in result:
         console.say(f"voxel {result['voxel']:.4g}, truncation {result['truncation']:.4g}, depth {result['depth']}")
@@ -77,7 +75,6 @@ def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console
         out=command.out,
         threads=command.threads,
     )
-    console.close()
     size, unseen = result["texture_size"], result["texels_unseen"] / max(result["texels"], 1)
     console.say(f"{result['files'][0]}: {result['faces']:,} triangles, {result['bytes'] / 1e6:.1f} MB")
     console.say(
@@ -106,7 +103,6 @@ def render(command: c.RenderCommand, console: Console) -> None:
         splats_file=command.splats,
         threads=command.threads,
     )
-    console.close()
     console.say(f"{result['images']} images in {result['folder']}")
     if "video" in result:
         console.say(f"{result['video']}: {result['seconds']:.1f} s, {result['video_bytes'] / 1e6:.1f} MB")
@@ -119,7 +115,6 @@ def view(command: c.ViewCommand, console: Console) -> None:
 
     server, shown = open_viewer(command.path, command.port, console.on_event)
     try:
-        console.close()
         console.say(f"{server.url}  (Ctrl-C ends it)")
         console.result({"url": server.url, "port": server.port, "shown": shown})
         console.flush()
@@ -134,7 +129,6 @@ def evaluate(command: c.EvaluateCommand, console: Console) -> None:
 
     _keep_to(command.memory)
     result = evaluate_run(command.run, command, console.on_event, threads=command.threads)
-    console.close()
     rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]
     if "exposure" in command.matched:
         rows += score_rows("test, matched", result["test_matched"])
@@ -174,7 +168,6 @@ def _export_page(command: c.ExportCommand, console: Console) -> None:
     if command.format not in (None, "html") or command.bbox is not None:
         raise RunError("an .html page takes neither another --format nor --bbox; leave them out")
     result = page_run(command.run, command.out, sh_degree=command.sh_degree, on_event=console.on_event)
-    console.close()
     console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
     console.result(result)
 
@@ -193,27 +186,18 @@ def edit(command: c.EditCommand, console: Console) -> None:
 def recipes(command: c.RecipesCommand, console: Console) -> None:
     """``gs2d recipes``."""
     from gs2d.config.presets import RECIPES, about_recipe, get_recipe
-    from gs2d.config.schedule import scale_schedule
-    from gs2d.config.serialize import apply_overrides, to_json
+    from gs2d.config.serialize import to_json
 
-    if command.action == "list":
-        if command.name:
-            raise RecipeError(f"`gs2d recipes list` takes no name, got {command.name!r}; use `gs2d recipes show NAME`")
-        names = {name: about_recipe(name) for name, _ in RECIPES.working()}
-        shown = {name: about for name, about in names.items() if command.all or name in (*EVERYDAY, *RECIPES.guests())}
-        width = max(map(len, shown))
-        for name, about in shown.items():
-            console.say(f"{name:<{width}}  {about}")
-        if len(shown) < len(names):
-            console.say(f"{len(names) - len(shown)} more recipes: --all")
-        console.result(names)
+    if command.name:
+        shown = to_json(get_recipe(command.name))
+        console.say(json.dumps(shown, indent=2))
+        console.result(shown)
         return
-    if not command.name:
-        raise RecipeError("`gs2d recipes show` needs the name of a recipe; `gs2d recipes` lists them")
-    recipe = apply_overrides(scale_schedule(get_recipe(command.name), command.schedule_scale), command.overrides)
-    values = to_json(recipe)
-    console.say(json.dumps(values, indent=2))
-    console.result(values)
+    names = sorted((name for name, _ in RECIPES.working()), key=lambda name: name not in EVERYDAY)
+    width = max(map(len, names))
+    for name in names:
+        console.say(f"{name:<{width}}  {about_recipe(name)}")
+    console.result({name: about_recipe(name) for name in names})
 
 
 def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
@@ -225,7 +209,6 @@ def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
     from gs2d.sfm.workspace import POSES_JSON
 
     run = run_all(command, console.on_event)
-    console.close()
     show_run(run.path, run.metrics(), console, extra={"poses": read_json(run.path / CAPTURE / POSES_JSON)})
     console.say(f"look at it: open {PAGE} in a browser, or gs2d view {shlex.quote(str(run.path))}")
 
@@ -236,7 +219,6 @@ def poses(command: c.PosesCommand, console: Console) -> None:
     from gs2d.pipeline.prepare.pose_finding import find_poses
 
     result = find_poses(command, console.on_event)
-    console.close()
     for line in poses_lines(result):
         console.say(line)
     console.result(result)

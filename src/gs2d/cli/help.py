@@ -6,22 +6,12 @@ import argparse
 import shutil
 from collections.abc import Sequence
 
-import gs2d
 from gs2d.cli.command_line import NAMES, Option, about, options_of
 from gs2d.cli.command_registry import COMMANDS, GROUPS
 from gs2d.cli.commands import Common
 from gs2d.pipeline.prepare.options import CommonTraining, HowItRuns, PoseEstimation, Training
 
 _SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."
-_FIRST_DAY = """usage: gs2d COMMAND [OPTIONS]
-
-  gs2d doctor                          check what this machine can run
-  gs2d demo                            try everything on a small synthetic scene
-  gs2d reconstruct PHOTOS --out RUN    photographs or a video to splats and mesh
-  gs2d view RUN                        look at the result in the browser
-  gs2d mesh RUN --texture              extract the mesh again, with a texture
-
-All commands: gs2d --help. Options of one: gs2d COMMAND --help."""
 _OWN = "Of this command"
 WIDEST = 100  # columns of help; longer lines are hard to read
 TITLES = {  # headings of shared options, in order
@@ -39,11 +29,6 @@ def groups() -> dict[str, list[str]]:
     for name in NAMES:
         by_title.setdefault(COMMANDS[name].group, []).append(name)
     return {title: names for title, names in by_title.items() if names}
-
-
-def first_day() -> list[str]:
-    """Return the help of ``gs2d`` alone: five commands for the first day."""
-    return [f"gs2d {gs2d.__version__}", "", *_FIRST_DAY.splitlines()]
 
 
 def program_help(*, everything: bool = False) -> list[str]:

@@ -34,14 +34,6 @@ _ELSEWHERE: dict[str, tuple[str, str]] = {  # option of other programs or earlie
     "--refine": ("--no-refine", "meshes of photographs are refined without an option"),
 }
 _OUTPUTS = ("out", "video", "cache")  # paths that need not exist
-_EXPECTED = {
-    "RUN": "a run folder",
-    "CAPTURE": "the folder of a capture",
-    "PHOTOS": "a folder of photographs or a video",
-    "DIR": "a folder",
-    "FILE": "a file",
-    "PATH": "a run folder, a capture or a file of splats, a mesh or points",
-}
 
 
 class UsageError(Exception):
@@ -169,9 +161,7 @@ def _check_exists(path: Path, option: Option) -> None:
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):
-        expected = _EXPECTED.get(option.metavar, "a file or a folder")
-        expected += " or a file of splats" if (option.field, option.metavar) == ("path", "RUN") else ""
-        raise UsageError(f"expected {expected} at {path}, found nothing{path_hint(path)}") from None
+        raise UsageError(f"expected {option.usage} at {path}, found nothing{path_hint(path)}") from None
     except (OSError, ValueError):
         pass  # reported by the reader of the path
 

@@ -371,7 +371,7 @@ def get_recipe(name: str) -> Recipe:
     Parameters
     ----------
     name : str
-        A registered name, ``file.json`` (from ``gs2d recipes show NAME --json``) or ``file.py:name`` (a Recipe, or a
+        A registered name, ``file.json`` (from ``gs2d recipes NAME --json``) or ``file.py:name`` (a Recipe, or a
         function without arguments that returns one).
 
     Returns
@@ -387,7 +387,7 @@ def get_recipe(name: str) -> Recipe:
         return read_recipe_file(name)
     if name not in RECIPES:
         near = did_you_mean(name, list(RECIPES))
-        raise RecipeError(f"no recipe {name!r}; `gs2d recipes --all` lists them{near}")
+        raise RecipeError(f"no recipe {name!r}; `gs2d recipes` lists them{near}")
     found = RECIPES.get(name)
     return found() if isinstance(found, NamedRecipe) else made_recipe(found, f"recipe {name!r}")
 

@@ -86,11 +86,11 @@ def _from_json_file(path: Path) -> Recipe:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise RecipeError(
-            f"{path} must be a recipe in JSON, got: {error.strerror or error}; `gs2d recipes show NAME` prints one"
+            f"{path} must be a recipe in JSON, got: {error.strerror or error}; `gs2d recipes NAME` prints one"
         ) from error
     except (ValueError, RecursionError) as error:
         raise RecipeError(
-            f"{path} must hold a recipe in JSON, as `gs2d recipes show NAME` prints it, got: {error}"
+            f"{path} must hold a recipe in JSON, as `gs2d recipes NAME` prints it, got: {error}"
         ) from error
     if not isinstance(data, dict):
         raise RecipeError(f"{path} must hold a recipe, an object of JSON, got {type(data).__name__}")
@@ -99,7 +99,7 @@ def _from_json_file(path: Path) -> Recipe:
     except RecursionError as error:
         raise RecipeError(f"{path} must hold a recipe, got values nested too deeply to read") from error
     except RecipeError as error:
-        raise RecipeError(f"{path}: {error}; `gs2d recipes show NAME` prints a whole one") from error
+        raise RecipeError(f"{path}: {error}; `gs2d recipes NAME` prints a whole one") from error
 
 
 @cache  # a file registers its names once

@@ -11,7 +11,7 @@ from gs2d.cli.commands import Common
 from gs2d.config.arguments import PYTHON_ONLY
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.recipe import Recipe
-from gs2d.pipeline.prepare.options import HowItRuns, ViewerOption, paths_of
+from gs2d.pipeline.prepare.options import HowItRuns, ViewerOption
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +32,6 @@ class DemoOptions(HowItRuns):
     test_views: Annotated[int, PYTHON_ONLY] = 8
     size: Annotated[int, PYTHON_ONLY] = 256
     """Width and height of the photographs, px."""
-
-    def __post_init__(self) -> None:
-        paths_of(self, "out")
 
 
 @register_command(

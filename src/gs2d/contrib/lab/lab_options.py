@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 
 from gs2d.config.arguments import Arg
 from gs2d.errors import RecipeError
-from gs2d.pipeline.prepare.options import CommonTraining, Overrides, Resources, paths_of
+from gs2d.pipeline.prepare.options import CommonTraining, Options, Overrides, Resources
 
 _PARTITION = "partition."  # prefix of changes of the partition in --set
 SWEEP = "sweep"  # the name of a table of chosen recipes
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableOptions:
+class TableOptions(Options):
     """Options of the commands that train and score many runs."""
 
     data: Annotated[Path, Arg(metavar="DIR")]
@@ -53,7 +53,7 @@ class TableOptions:
     """Only write the table of finished runs."""
 
     def __post_init__(self) -> None:
-        paths_of(self, "data", "out", "cache", "ground_truth", "lpips_weights")
+        super().__post_init__()
         object.__setattr__(self, "scenes", _split(self.scenes))
         object.__setattr__(self, "seeds", parse_seeds(self.seeds))
 
@@ -137,9 +137,6 @@ class BlocksOptions(CommonTraining, Resources):
     """CPU threads per block (default: the cores divided by the number of parallel runs)."""
     masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
-
-    def __post_init__(self) -> None:
-        paths_of(self, "scene", "out", "masks")
 
     @property
     def partition_changes(self) -> tuple[str, ...]:

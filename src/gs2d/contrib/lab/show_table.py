@@ -17,7 +17,6 @@ from gs2d.errors import RunError
 def show_blocks(command: BlocksCommand, console: Console) -> None:
     """Run ``gs2d blocks``."""
     run = blocks(command, console.on_event)
-    console.close()
     show_run(run.path, run.metrics(), console)
 
 
@@ -30,7 +29,6 @@ def show_table(command: PaperCommand | SweepCommand, console: Console) -> None:
         At the end, if runs failed.
     """
     result = run_paper(command, console.on_event)
-    console.close()
     _tables(result, console)
     if command.json:
         files = {path.name: str(path) for path in result.files}

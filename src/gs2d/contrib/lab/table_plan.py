@@ -137,7 +137,7 @@ def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
 def paper_command(options: PaperOptions | SweepOptions) -> str:
     """Return the command line of a table."""
     words = ["sweep", *options.recipes] if isinstance(options, SweepOptions) else ["paper", options.table]
-    said = ("table", "recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json", "debug")
+    said = ("table", "recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json")
     return _command(words, options, said)
 
 

@@ -31,7 +31,6 @@ def survey(command: SurveyCommand, console: Console) -> None:
         result["orthophoto"] = orthophoto_run(*options, threads=command.threads)
     elif command.out is not None:
         result["export"] = export_world(command.run, command.out, command.part)
-    console.close()
     none = "no georeference; --gps, --positions, --control, --known-distance or --markers finds one"
     for line in [none] if georeference is None else georeference.lines():
         console.say(line)

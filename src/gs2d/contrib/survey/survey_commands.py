@@ -9,13 +9,13 @@ from typing import Annotated, Literal
 from gs2d.cli.command_registry import LOOK, register_command
 from gs2d.cli.commands import Common, RunPath
 from gs2d.config.arguments import SETTING, Arg
-from gs2d.pipeline.prepare.options import paths_of
+from gs2d.pipeline.prepare.options import Options
 
 KnownDistance = tuple[float, float, float, float, float, float, float]  # two points of the run, metres
 
 
 @dataclass(frozen=True, kw_only=True)
-class GeoreferenceOptions:
+class GeoreferenceOptions(Options):
     """Source and coordinate system of a georeference; without a source, the current one is shown."""
 
     gps: bool = False
@@ -41,12 +41,9 @@ class GeoreferenceOptions:
     remove: bool = False
     """Delete the georeference of the run."""
 
-    def __post_init__(self) -> None:
-        paths_of(self, "positions", "control")
-
 
 @dataclass(frozen=True, kw_only=True)
-class OrthophotoOptions:
+class OrthophotoOptions(Options):
     """Options of the orthophoto."""
 
     resolution: Annotated[float | None, Arg(metavar="METRES", setting=True)] = None

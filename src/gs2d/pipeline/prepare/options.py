@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from gs2d.config.arguments import SETTING, Arg
 from gs2d.config.presets import DEFAULT_RECIPE
@@ -28,14 +28,7 @@ BoxOption = Annotated[Box | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
 Transform = tuple[float, float, float, float, float, float, float]
 Overrides = Annotated[tuple[str, ...], Arg(name="set", metavar="STAGE.FIELD=VALUE", repeated=True)]
 ViewerOption = Annotated[int | None, Arg(metavar="[PORT]", bare="0")]  # 0: the first free port
-Photos = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
-
-
-def paths_of(options: object, *names: str) -> None:
-    """Convert string values of the named fields to paths."""
-    for name in names:
-        if isinstance(value := getattr(options, name), str):
-            object.__setattr__(options, name, Path(value))
+PhotosPath = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
 
 
 def values(kind: type[Any], options: Any) -> dict[str, Any]:
@@ -60,9 +53,27 @@ def learned_names(learn: str | tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
+def check_choices(options: object) -> None:
+    """Raise RecipeError for a value that is none of the choices of its field."""
+    for name, hint in get_type_hints(type(options)).items():
+        choices = [one for kind in (hint, *get_args(hint)) if get_origin(kind) is Literal for one in get_args(kind)]
+        if choices and (value := getattr(options, name)) not in (*choices, None):
+            raise RecipeError(f"--{name.replace('_', '-')} must be one of {', '.join(choices)}, got {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Base class of options: in fields that hold paths, text becomes a path."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            if "Path" in str(entry.type) and isinstance(value := getattr(self, entry.name), str):
+                object.__setattr__(self, entry.name, Path(value))
+
+
 # -- shared by several commands ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class HowItRuns:
+class HowItRuns(Options):
     """How training runs: options of every command that trains one run."""
 
     out: Annotated[Path, Arg(metavar="RUN")]
@@ -80,7 +91,7 @@ class HowItRuns:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resources:
+class Resources(Options):
     """Limits of this machine."""
 
     memory: Annotated[float | None, Arg(metavar="GIB")] = None
@@ -88,7 +99,7 @@ class Resources:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Effort:
+class Effort(Options):
     """Training length and image size, with the same defaults in `gs2d train` and `gs2d reconstruct`."""
 
     quality: Quality = "auto"
@@ -102,7 +113,7 @@ class Effort:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommonTraining:
+class CommonTraining(Options):
     """What is trained and how: options of every command that trains on photographs."""
 
     recipe: str | Recipe = DEFAULT_RECIPE
@@ -154,7 +165,7 @@ class Training(CommonTraining):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseEstimation:
+class PoseEstimation(Options):
     """How the cameras of photographs are estimated: options of `gs2d poses` and `gs2d reconstruct`."""
 
     cameras: Annotated[Literal["auto", "one", "each"], SETTING] = "auto"
@@ -201,16 +212,12 @@ class TrainOptions(Training, Effort, Resources, HowItRuns):
     """Start from the splats of a file (PLY, .spz, .splat, .usd, .glb, .sog) instead of points, in the frame of the
     capture. 3D Gaussians are flattened along their smallest scale."""
 
-    def __post_init__(self) -> None:
-        paths_of(self, "scene", "out", "masks", "init", "cache")
-        object.__setattr__(self, "checkpoint_every", str(self.checkpoint_every))
-
 
 @dataclass(frozen=True, kw_only=True)
 class PosesOptions(PoseEstimation):
     """Options of structure from motion."""
 
-    photos: Photos
+    photos: PhotosPath
     """Folder of photographs, or a video. It is only read."""
     out: Annotated[Path, Arg(metavar="CAPTURE")]
     """Capture folder to create: images/, sparse/0, poses.json, poses.png."""
@@ -221,15 +228,12 @@ class PosesOptions(PoseEstimation):
     overwrite: bool = False
     """Replace the capture in --out, if this command created it."""
 
-    def __post_init__(self) -> None:
-        paths_of(self, "photos", "out", "positions", "masks")
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructOptions(Effort, Resources, HowItRuns):
     """Options of a reconstruction, from photographs to a mesh."""
 
-    photos: Photos
+    photos: PhotosPath
     """Folder of photographs, or a video. It is only read."""
     out: Annotated[Path, Arg(metavar="RUN")]
     """Run folder to create. Photographs and cameras go to its sub-folder `capture`."""
@@ -240,13 +244,10 @@ class ReconstructOptions(Effort, Resources, HowItRuns):
     finding: PoseEstimation = field(default_factory=PoseEstimation)
     """As in `gs2d poses`."""
 
-    def __post_init__(self) -> None:
-        paths_of(self, "photos", "out")
-
 
 # -- commands that need a finished run ---------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class MeshOptions:
+class MeshOptions(Options):
     """How the surface is extracted. None: derived from the scene, or taken from the protocol of the run."""
 
     method: Annotated[str, Arg(metavar="METHOD")] = "tsdf"
@@ -280,7 +281,7 @@ class MeshOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TextureOptions:
+class TextureOptions(Options):
     """How the mesh is textured."""
 
     faces: Annotated[int, SETTING] = 50_000
@@ -292,7 +293,7 @@ class TextureOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderOptions:
+class RenderOptions(Options):
     """Which images of a run are rendered."""
 
     split: Literal["test", "train"] | None = None
@@ -306,12 +307,9 @@ class RenderOptions:
     fps: Annotated[float, SETTING] = 30.0
     """Frames per second of the video."""
 
-    def __post_init__(self) -> None:
-        paths_of(self, "video")
-
 
 @dataclass(frozen=True, kw_only=True)
-class EditOptions:
+class EditOptions(Options):
     """The edit of splats; one of the options, or ``merge`` with ``transform``."""
 
     keep_box: BoxOption = None
@@ -325,12 +323,9 @@ class EditOptions:
     undo: bool = False
     """Restore the splats of the run before the last edit; may be repeated."""
 
-    def __post_init__(self) -> None:
-        paths_of(self, "merge")
-
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
+class EvaluateOptions(Options):
     """What `gs2d evaluate` measures."""
 
     ground_truth: Annotated[Path | None, Arg(metavar="MESH_OR_POINTS")] = None
@@ -349,6 +344,3 @@ class EvaluateOptions:
         if set(names) - set(MATCHED):
             raise RecipeError(f"--match must name {' or '.join(MATCHED)}, got {','.join(names)}")
         return names
-
-    def __post_init__(self) -> None:
-        paths_of(self, "ground_truth", "lpips_weights")

@@ -23,7 +23,7 @@ from gs2d.data.masks import FOLDER
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.prepare.options import PosesOptions
+from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_choices, values
 from gs2d.pipeline.prepare.photo_positions import metric_positions
 from gs2d.sfm.as_fisheye import FISHEYE
 from gs2d.sfm.colmap_process import Group, Request, Solved, check_installed, layers, read_facts, solve
@@ -57,23 +57,9 @@ from gs2d.sfm.workspace import (
 )
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", PANORAMA)
-MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
-MAPPERS = ("auto", "incremental", "global")
 MANY = 500  # photographs; more: "auto" uses the global mapper (docs/notebook/sfm.md)
 ALL_PAIRS = 150  # photographs; up to this number "auto" matches every pair
 POSITIONED = 0.5  # fraction of photographs with positions from which "auto" matches spatially
-REQUESTED = (  # options that determine the capture; poses.json keeps them
-    *("cameras", "camera_model", "matching", "overlap", "neighbours", "positions"),
-    *("mapper", "max_size", "feature_size", "frames", "seed"),
-    *("masks", "match_masked"),
-)
-CHOICES = {
-    "cameras": ("auto", "one", "each"),
-    "camera_model": ("auto", *CAMERA_MODELS),
-    "matching": MATCHINGS,
-    "mapper": MAPPERS,
-}
 SMALLEST_SIDE, MAX_THREADS = 64, 1024
 LIMITS = {
     "max_size": (SMALLEST_SIDE, 1 << 16),
@@ -166,10 +152,8 @@ def _kept(work: Path, on_event: OnEvent) -> Iterator[None]:
 
 # -- input -------------------------------------------------------------------------------------------------------------
 def check_poses_options(options: PosesOptions) -> None:
-    """Raise RunError for an invalid option."""
-    for name, allowed in CHOICES.items():
-        if (value := getattr(options, name)) not in allowed:
-            raise RunError(f"--{name.replace('_', '-')} must be one of {', '.join(allowed)}, got {value}")
+    """Raise for an invalid option."""
+    check_choices(options)
     for name, (least, most) in LIMITS.items():
         value = getattr(options, name)
         if value is not None and not (isinstance(value, int) and least <= value <= most):
@@ -178,7 +162,7 @@ def check_poses_options(options: PosesOptions) -> None:
 
 def requested_options(options: PosesOptions) -> dict[str, Any]:
     """Return the options that determine the capture, as ``poses.json`` keeps them."""
-    requested = {name: getattr(options, name) for name in REQUESTED}
+    requested = {**values(PoseEstimation, options), "seed": options.seed}
     return {name: str(value.resolve()) if isinstance(value, Path) else value for name, value in requested.items()}
 
 
@@ -355,7 +339,6 @@ def _read_models(
         placed = photo.name in best.names
         reason = {} if placed else {"reason": why_not_placed(photo.name, models, facts)}
         rows.append({**row, "placed": placed, **reason})
-    used = {name: getattr(options, name) for name in ("overlap", "neighbours", "max_size", "feature_size", "seed")}
     return models, {
         "photos": str(options.photos.resolve()),
         "count": len(photos),
@@ -378,7 +361,6 @@ def _read_models(
             "mapper": request.mapper,
             "pairs_matched": len(facts.matches),
             "threads": request.threads,
-            **used,
         },
         "created": now(),
     }

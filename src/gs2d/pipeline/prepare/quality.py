@@ -9,7 +9,6 @@ from types import MappingProxyType
 
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
-from gs2d.errors import RecipeError
 
 
 @dataclass(frozen=True)
@@ -39,12 +38,6 @@ QUALITIES: Mapping[str, Mapping[str, QualityLevel]] = MappingProxyType(
 )
 
 
-def check_quality(name: str) -> None:
-    """Raise for an unknown name."""
-    if name not in ("auto", *QUALITIES):
-        raise RecipeError(f"--quality must be one of auto, {', '.join(QUALITIES)}, got {name}")
-
-
 def quality_level(name: str, *, is_data_set: bool, on_host: bool) -> QualityLevel | None:
     """Return what a quality means; None: the whole recipe on full-size images.
 
@@ -56,7 +49,6 @@ def quality_level(name: str, *, is_data_set: bool, on_host: bool) -> QualityLeve
     on_host : bool
         Whether the CPU trains.
     """
-    check_quality(name)
     if name == "auto" and is_data_set:
         return None
     return QUALITIES["normal" if name == "auto" else name]["cpu" if on_host else "gpu"]

@@ -25,15 +25,13 @@ from gs2d.data.subject_box import check_subject_box
 from gs2d.errors import ProtocolError, RecipeError
 from gs2d.losses.base import losses_of
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points
-from gs2d.pipeline.prepare.options import Training, TrainOptions
-from gs2d.pipeline.prepare.quality import check_quality
+from gs2d.pipeline.prepare.options import Training, TrainOptions, check_choices
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.point_gains import point_gains
 from gs2d.training.robust.backdrop import find_backdrop
 from gs2d.training.robust.robustness import check_free_space
 
 MAX_VIEWS = 1_000_000
-ROBUST = ("auto", "on", "off")
 DIFFERS = 0.03  # standard deviation of the logarithm of gains; more: the exposures of the photographs differ
 
 
@@ -97,9 +95,7 @@ def build_recipe(
 
 def check_options(options: TrainOptions) -> None:
     """Raise for invalid options, before anything is read."""
-    if options.robust not in ROBUST:
-        raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
-    check_quality(options.quality)
+    check_choices(options)
     scale = 1.0 if options.schedule_scale is None else options.schedule_scale
     robust, exposure = options.robust != "off", "exposure" in options.learned
     build_recipe(options, seed=options.seed, schedule_scale=scale, robust=robust, exposure=exposure)
