@@ -130,7 +130,6 @@ def values_of(parsed: object, field: str) -> list[object]:
         ("train --viewer 81 in --out out", "viewer", 81),
         ("mesh run --set depth=median --set faces=9", "faces", 9),
         ("survey run --set up=0,1,0", "up", (0, 1, 0)),
-        ("train in --out out --set stage2_cache_mb=9 --set a=1", "overrides", ("a=1",)),
     ],
 )
 def test_option_words_become_values(words: str, field: str, value: object) -> None:

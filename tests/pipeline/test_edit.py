@@ -71,7 +71,7 @@ def test_files_made_from_other_splats_are_named(copy: RunFolder) -> None:
         os.utime(copy.file(name), (1000 + number, 1000 + number))
     copy.file("scene.html").unlink(missing_ok=True)
     (text,) = edit(copy.path, EditOptions(keep_box=BOX))["notes"]
-    assert text.startswith("mesh.ply, report.html: made from other splats; make again: ")
+    assert text.startswith("mesh.ply, report.html, verdict.json: made from other splats; make again: ")
     assert text.endswith(f"gs2d mesh {copy.path}; gs2d evaluate {copy.path}")
     copy.file("mesh.ply").write_bytes(copy.file("mesh.ply").read_bytes())  # as `gs2d mesh` does
     (text,) = edit(copy.path, EditOptions(undo=True))["notes"]

@@ -93,7 +93,6 @@ def test_resume_uses_the_previous_checkpoint_if_the_last_is_damaged(
         ({"overrides": (*SMALL, "refine.iterations=25")}, "recipe"),
         ({"protocol": "generic"}, "synthetic"),
         ({"downscale": 2}, "another"),
-        ({"stage2_cache_mb": 0}, "stage2_cache_bytes"),
     ],
 )
 def test_resuming_with_other_options_is_an_error_with_the_difference(

@@ -132,7 +132,6 @@ def test_a_full_disk_before_the_first_checkpoint_leaves_nothing(
     [
         ({"downscale": 0}, "got 0"),
         ({"checkpoint_every": 0}, "got 0"),
-        ({"stage2_cache_mb": -1}, "got -1"),
         ({"checkpoint_every": "2h"}, "got 2h"),
         ({"learn": "poses,size"}, "got 'size'"),
         ({"threads": 0}, "got 0"),

@@ -145,7 +145,7 @@ def test_a_folder_that_is_no_run_is_an_error_and_a_broken_file_loses_only_its_pa
     (run / "renders" / "index.json").write_text("{")
     failed: list[tuple[str, Exception]] = []
     text = text_of(write_report(run, on_failure=lambda part, error: failed.append((part, error))).read_text())
-    assert [part for part, _ in failed] == ["comparison with a photograph", "section views"]
+    assert [part for part, _ in failed] == ["gallery", "section views"]
     assert all(isinstance(error, DataError) and "index.json" in str(error) for _, error in failed)
     assert "The section views could not be made: " in text
     (run / "run.json").write_text("{")
@@ -156,9 +156,9 @@ def test_a_folder_that_is_no_run_is_an_error_and_a_broken_file_loses_only_its_pa
 # -- sections ----------------------------------------------------------------------------------------------------------
 def test_the_order_of_the_sections_is_that_of_the_registry(page: str) -> None:
     shown = re.findall(r'<details class="section" id="(\w+)"', page)
-    assert shown == [*(name for name in SECTIONS if name in shown and name != "terms"), "terms"]
+    assert shown == [name for name in SECTIONS if name in shown]
     assert shown[0] == "results"
-    assert {"views", "training", "surface", "files", "settings", "terms"} <= set(shown)
+    assert {"views", "training", "surface", "files", "settings"} <= set(shown)
 
 
 def test_the_table_of_results_marks_the_best_and_has_no_empty_row() -> None:

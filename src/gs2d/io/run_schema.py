@@ -31,7 +31,6 @@ DEFINITION_SHAPE: Shape = {
     "machine?": dict,
     "created?": (str, None),
     "title?": (str, None),
-    "stage2_cache_bytes?": int,
     "schedule_scale?": _NUMBER,
 }
 METRICS_SHAPE: Shape = {

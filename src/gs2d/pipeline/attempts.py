@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from gs2d.core.atomic_files import is_full
 from gs2d.errors import Gs2dError
+from gs2d.io.run_dir import MESH, PAGE, REPORT, TEXTURED, VERDICT, RunFolder
 from gs2d.training.events import NotMade, OnEvent
 
 LONGEST = 500  # characters of a message that is not ours
+REMADE_BY = {  # files of a finished run, and the command that makes them again
+    MESH: ("mesh",),
+    TEXTURED: ("mesh", "--texture"),
+    REPORT: ("evaluate",),
+    VERDICT: ("evaluate",),
+    PAGE: ("export", "--format", "html"),
+}
 
 
 @contextmanager
@@ -39,6 +47,17 @@ def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[Non
 def again(verb: str, path: Path, *more: object) -> str:
     """Return the command line of ``gs2d VERB`` for a run."""
     return shlex.join(["gs2d", verb, str(path), *map(str, more)])
+
+
+def remade_by(run: RunFolder, name: str) -> str:
+    """Return the command line that makes a file of a finished run again."""
+    verb, *more = REMADE_BY[name]
+    return again(verb, run.path, *more)
+
+
+def attempted_file(run: RunFolder, name: str, on_event: OnEvent) -> AbstractContextManager[None]:
+    """Attempt to make a file of a finished run."""
+    return attempted(name, remade_by(run, name), on_event)
 
 
 def reason_of(error: Exception) -> str:

@@ -16,7 +16,7 @@ from gs2d.data.masks import OFF
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, remove_made
 from gs2d.meshing.texture import required
-from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.attempts import attempted_file
 from gs2d.pipeline.finish.run_texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.finish.run_texture import texture_run
 from gs2d.pipeline.prepare.options import (
@@ -103,7 +103,7 @@ def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
     training = replace(train_options(options), overwrite=False)
     run = train(training, on_event, title=_title(options.photos.resolve()), allowed=_allowed(options))
     if options.texture and not run.file(TEXTURED).exists():
-        with attempted(TEXTURED, again("mesh", run.path, "--texture"), on_event):
+        with attempted_file(run, TEXTURED, on_event):
             if not run.file(MESH).exists():
                 raise ProtocolError(f"there is no {MESH} to texture")
             texture_run(run.path, on_event=on_event, threads=options.threads)

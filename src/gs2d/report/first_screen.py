@@ -8,7 +8,7 @@ from typing import Any
 
 from gs2d.core.text import duration
 from gs2d.io.run_dir import MESH, RENDERS
-from gs2d.report.gallery import compared, read_gallery
+from gs2d.report.gallery import Gallery, compared, read_gallery
 from gs2d.report.html_parts import Pair, render
 from gs2d.report.mesh_view import MeshView, mesh_view
 from gs2d.report.part_guard import Guard
@@ -19,8 +19,11 @@ from gs2d.report.sections.verdict_section import read_verdict
 def first_screen(run: RunRecord, guard: Guard) -> str:
     """Return the first screen; a part that fails is replaced by its error."""
     verdict = guard("verdict", lambda: read_verdict(run.path))
-    pair = guard("comparison with a photograph", lambda: _pair(run))
-    mesh = guard("view of the mesh", lambda: mesh_view(run.path, run.cameras))
+    found = guard("gallery", lambda: read_gallery(run.path / RENDERS))
+    gallery = found if isinstance(found, Gallery) else None
+    cameras = [view.camera for view in gallery.views if view.camera is not None] if gallery is not None else []
+    pair = found if isinstance(found, str) else guard("comparison with a photograph", lambda: _pair(gallery))
+    mesh = guard("view of the mesh", lambda: mesh_view(run.path, cameras))
     known = verdict if isinstance(verdict, Mapping) else {}
     return render(
         "first_screen.html",
@@ -44,9 +47,8 @@ def _sentence(run: RunRecord, verdict: Mapping[str, Any]) -> str:
     return str(verdict.get("headline", "The result was not scored."))
 
 
-def _pair(run: RunRecord) -> Pair | str:
+def _pair(gallery: Gallery | None) -> Pair | str:
     """Return the first view beside its photograph, or why there is none."""
-    gallery = read_gallery(run.path / RENDERS)
     pair = compared(gallery, gallery.views[0], width=1000) if gallery is not None and gallery.views else None
     return "There is no rendering yet. `gs2d render RUN` writes some." if pair is None else pair
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.data.image_files import read_image
 from gs2d.io.run_dir import RENDERS
@@ -25,6 +26,7 @@ class ShownView:
     file: str
     split: str
     depth_limits: tuple[float, float] | None = None
+    camera: Camera | None = None
 
     @property
     def kind(self) -> str:
@@ -92,7 +94,8 @@ def _shown_view(entry: dict[str, Any]) -> ShownView:
     """Return an entry of ``views``."""
     name, limits = entry["name"], entry.get("depth_limits")
     depth_limits = None if limits is None else (float(limits[0]), float(limits[1]))
-    return ShownView(str(name), str(entry.get("file", name)), str(entry.get("split", "")), depth_limits)
+    camera = Camera(**entry["camera"]) if "camera" in entry else None
+    return ShownView(str(name), str(entry.get("file", name)), str(entry.get("split", "")), depth_limits, camera)
 
 
 def compared(gallery: Gallery, view: ShownView, *, width: int = 800) -> Pair | None:

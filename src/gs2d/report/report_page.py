@@ -6,32 +6,27 @@ run folder.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from markupsafe import Markup
 
 from gs2d.core.atomic_files import atomic_write
-from gs2d.core.camera import Camera
 from gs2d.io.run_dir import REPORT
 from gs2d.report.first_screen import first_screen
 from gs2d.report.html_parts import macro, missing, page
 from gs2d.report.part_guard import Guard, OnFailure
 from gs2d.report.run_record import RunRecord, read_record
-from gs2d.report.sections.section_registry import GLOSSARY, SECTIONS, Section
+from gs2d.report.sections.section_registry import SECTIONS, Section
 
 
-def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFailure | None = None) -> Path:
+def write_report(run: Path, *, on_failure: OnFailure | None = None) -> Path:
     """Write ``report.html`` into a run folder.
 
     Parameters
     ----------
     run : Path
         A run folder, finished or not.
-    cameras : sequence of Camera, optional
-        Cameras of the rendered views. The mesh is first shown from the first one. Default: from above, with the third
-        axis up.
     on_failure : callable, optional
         Receives the name and the error of each part that fails; the report shows the error in its place.
 
@@ -49,7 +44,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
     DiskError
         If the report cannot be written.
     """
-    record, guard = read_record(run, cameras), Guard(on_failure)
+    record, guard = read_record(run), Guard(on_failure)
     body = [first_screen(record, guard), *_sections(record, guard)]
     target = record.path / REPORT
     with atomic_write(target, "w") as file:
@@ -60,7 +55,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
 def _sections(record: RunRecord, guard: Guard) -> list[str]:
     """Return the sections that have something to show, folded."""
     made: list[str] = []
-    for name, section in sorted(SECTIONS.working(), key=lambda item: item[0] == GLOSSARY):
+    for name, section in SECTIONS.working():
         html = guard(f"section {name}", partial(_html, section, record))
         if html:
             shown = html if isinstance(html, Markup) else missing(html)

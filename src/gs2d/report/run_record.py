@@ -10,7 +10,6 @@ from typing import Any
 
 from jinja2 import UndefinedError
 
-from gs2d.core.camera import Camera
 from gs2d.errors import DataError
 from gs2d.io.run_dir import open_run
 
@@ -32,8 +31,6 @@ class RunRecord:
     surface_reason : str or None
     events : list of dict
         ``events.jsonl``.
-    cameras : sequence of Camera
-        Cameras of the rendered views.
     """
 
     path: Path
@@ -42,7 +39,6 @@ class RunRecord:
     surface: dict[str, Any] | None = None
     surface_reason: str | None = None
     events: Sequence[dict[str, Any]] = ()
-    cameras: Sequence[Camera] = ()
 
     @property
     def last(self) -> Mapping[str, Any]:
@@ -73,7 +69,7 @@ class RunRecord:
         return str(self.definition.get("title") or name_of(scene or self.path.name))
 
 
-def read_record(folder: Path, cameras: Sequence[Camera] = ()) -> RunRecord:
+def read_record(folder: Path) -> RunRecord:
     """Read what the report needs of a run folder.
 
     Raises
@@ -92,7 +88,6 @@ def read_record(folder: Path, cameras: Sequence[Camera] = ()) -> RunRecord:
         surface=metrics.get("surface"),
         surface_reason=metrics.get("surface_reason"),
         events=run.events.read(),
-        cameras=cameras,
     )
 
 

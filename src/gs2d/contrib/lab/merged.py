@@ -119,7 +119,6 @@ def merged_run(settled: Settled, options: TrainOptions, scene: Scene) -> LoadedR
         downscale=options.downscale or 1,
         raster=raster_settings(settled.protocol, scene.extent, settled.recipe.sh_degree, settled.recipe.mip_px),
         backend=settled.backend.facts(),
-        stage2_cache_bytes=options.stage2_cache_mb << 20,
         schedule_scale=1.0 if options.schedule_scale is None else options.schedule_scale,
         title=settled.scene.name,
         execution=Execution(**values(Execution, options)),

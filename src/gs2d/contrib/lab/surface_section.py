@@ -11,7 +11,6 @@ import numpy as np
 from gs2d.data.image_files import read_image
 from gs2d.report.html_parts import missing, render
 from gs2d.report.run_record import RunRecord
-from gs2d.report.sections.glossary import titles_of
 from gs2d.report.sections.section_registry import register_section
 
 _COLUMNS = {"threshold": "Threshold", "precision": "Precision", "recall": "Recall", "f_score": "F-score"}
@@ -62,7 +61,6 @@ def surface_section(run: RunRecord) -> str | None:
         "surface.html",
         scores=scores,
         columns=columns,
-        titles=titles_of(columns),
         counted=_COUNTED.get(str(surface.get("evaluator", "visible-surface")), ""),
         warnings=_warnings(surface.get("self_check") or {}),
         figures=[_row(name, surface[name]) for name in names if _is_figure(surface[name])],

@@ -10,9 +10,8 @@ from gs2d.contrib.survey.find_georeference import SOURCES, georeference_run
 from gs2d.contrib.survey.orthophoto import orthophoto_run
 from gs2d.contrib.survey.survey_commands import SurveyCommand
 from gs2d.errors import RunError
-from gs2d.io.run_dir import PAGE, open_run
-from gs2d.pipeline.finish.run_report import report_again
-from gs2d.pipeline.look.page import page_run
+from gs2d.io.run_dir import open_run
+from gs2d.pipeline.finish.run_report import show_again
 
 
 def survey(command: SurveyCommand, console: Console) -> None:
@@ -21,10 +20,7 @@ def survey(command: SurveyCommand, console: Console) -> None:
         raise RunError("--set resolution belongs to --orthophoto, which was not given")
     georeference = georeference_run(command.run, command, console.on_event)
     if command.remove or any(getattr(command, source) not in (None, False) for source in SOURCES):
-        run = open_run(command.run)
-        if run.file(PAGE).exists():
-            page_run(run.path, on_event=console.on_event)
-        report_again(run, console.on_event)
+        show_again(open_run(command.run), console.on_event)
     result: dict[str, Any] = {"run": str(command.run), "georeference": georeference and georeference.to_json()}
     if command.orthophoto:
         options = (command.run, command.out, command, console.on_event)

@@ -22,20 +22,13 @@ from gs2d.data.subject_box import LARGEST
 from gs2d.errors import RunError
 from gs2d.io.formats.splat_formats import write_layout
 from gs2d.io.gaussians import Gaussians, Tell
-from gs2d.io.run_dir import EDITS, MESH, PAGE, REPORT, SPLATS, TEXTURED, RunFolder, make_folder, open_run
+from gs2d.io.run_dir import EDITS, SPLATS, RunFolder, make_folder, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
-from gs2d.pipeline.attempts import again
+from gs2d.pipeline.attempts import REMADE_BY, remade_by
 from gs2d.pipeline.finish.export import checked_layout, splats_of
 from gs2d.pipeline.finish.run_subject import centers_inside
 from gs2d.pipeline.prepare.loaded import finished_splats
 from gs2d.pipeline.prepare.options import EditOptions, Transform
-
-REMADE_BY = {  # files made from the splats, and the command that makes them again
-    MESH: ("mesh",),
-    TEXTURED: ("mesh", "--texture"),
-    REPORT: ("evaluate",),
-    PAGE: ("export", "--format", "html"),
-}
 
 
 def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str, Any]:
@@ -76,7 +69,9 @@ def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str,
             _replace(run, before, edited)
     outdated = _outdated(run, since if options.undo else None)
     if outdated:
-        notes.append(f"{', '.join(outdated)}: made from other splats; make again: {'; '.join(outdated.values())}")
+        notes.append(
+            f"{', '.join(outdated)}: made from other splats; make again: {'; '.join(dict.fromkeys(outdated.values()))}"
+        )
     return {"file": str(run.file(SPLATS)), "splats": len(edited), "before": len(before), "notes": notes}
 
 
@@ -180,7 +175,7 @@ def _outdated(run: RunFolder, undone_at: int | None) -> dict[str, str]:
     """
     since = math.inf if undone_at is None else run.file(SPLATS).stat().st_mtime_ns
     return {
-        name: again(command[0], run.path, *command[1:])
-        for name, command in REMADE_BY.items()
+        name: remade_by(run, name)
+        for name in REMADE_BY
         if run.file(name).exists() and not since <= run.file(name).stat().st_mtime_ns < (undone_at or 0)
     }

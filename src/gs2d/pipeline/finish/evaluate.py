@@ -13,7 +13,7 @@ from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.evaluation.lpips import load_lpips
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, SURFACE, VERDICT
-from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.attempts import attempted_file
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.finish.scoring import ScoreOptions, score_views, split_metrics
@@ -76,7 +76,7 @@ def evaluate_run(
         last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
-        with attempted(VERDICT, again("evaluate", path), on_event):
+        with attempted_file(run, VERDICT, on_event):
             result["verdict"] = write_verdict(run, loaded, collected)["verdict"]
     report_again(run, on_event)
     return result

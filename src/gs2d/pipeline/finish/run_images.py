@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,7 @@ from gs2d.data import Scene, View
 from gs2d.data.image_files import write_image
 from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.io.run_dir import (
-    LOCK,
-    RENDERS,
-    RunFolder,
-    make_folder,
-    remove_made,
-)
+from gs2d.io.run_dir import RENDERS, RunFolder, make_folder, remove_made
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
@@ -58,6 +52,7 @@ IMAGES = ("color", "normal", "depth", "error", "high_error")
 SHOWN_VIEWS = 3  # rendered after each stage for the report
 MAX_FRAMES = 100_000  # of an orbit
 MAX_WIDTH = 1 << 14  # px
+FPS = 30.0  # of a video
 
 
 # -- images of the report ----------------------------------------------------------------------------------------------
@@ -149,18 +144,6 @@ def camera_json(camera: Camera) -> dict[str, Any]:
     return {**facts, "T_cam_world": camera.T_cam_world.tolist()}
 
 
-def shown_cameras(run: RunFolder) -> list[Camera]:
-    """Return the cameras of the drawn views; none before the first stage."""
-    index = read_index(run.file(RENDERS)) or {"views": []}
-    try:
-        return [Camera(**entry["camera"]) for entry in index["views"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{run.file(RENDERS) / INDEX} does not hold the camera of each view ({error}); delete it (the report then "
-            "has no images of views), or train again with --overwrite"
-        ) from error
-
-
 def render_view(splats: Splats, view: View, settings: RasterSettings, backend: Backend) -> RenderOutput:
     """Render a view without gradients."""
     with torch.no_grad():
@@ -207,7 +190,7 @@ def render_run(
         _spare_photographs([video], "--video", loaded)
     folder = out or run.file(RENDERS) / kind
     made = make_folder(folder)
-    with _alone_in(folder) if out is None else contextlib.nullcontext():
+    with run.locked() if out is None else contextlib.nullcontext():
         if options.orbit and out is None:  # remove the frames of a longer video
             for old in folder.glob("[0-9]*.png"):
                 if old.stem.isdecimal():
@@ -222,8 +205,6 @@ def render_run(
         except BaseException:  # a full disk, Ctrl-C: leave no partial set of images
             for image in written:
                 image.unlink(missing_ok=True)
-            if made and out is None:
-                (folder / LOCK).unlink(missing_ok=True)
             remove_made(made)
             raise
         result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
@@ -233,8 +214,8 @@ def render_run(
         frames = [folder / f"{name}.png" for name, _ in views]
         with attempted(str(video), again("render", path, "--orbit", len(views), "--video", video), on_event):
             threads = torch.get_num_threads()
-            write_video(video, frames, fps=options.fps, threads=threads, on_frame=lambda done: on_event(Step(done)))
-            result |= {"video": str(video), "seconds": len(views) / options.fps, "video_bytes": video.stat().st_size}
+            write_video(video, frames, fps=FPS, threads=threads, on_frame=lambda done: on_event(Step(done)))
+            result |= {"video": str(video), "seconds": len(views) / FPS, "video_bytes": video.stat().st_size}
         return result
 
 
@@ -264,17 +245,6 @@ def _at_width(camera: Camera, width: int) -> Camera:
     return camera.resized(width, max(1, round(camera.height * width / camera.width)))
 
 
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Lock a folder of the run against other commands that render into it."""
-    with contextlib.ExitStack() as held:
-        try:
-            held.enter_context(RunFolder(folder).locked())
-        except RunError as error:
-            raise RunError(f"another process writes {folder}; wait for it or choose another --out") from error
-        yield
-
-
 def check_frames(options: RenderOptions) -> None:
     """Raise for invalid options."""
     from gs2d.io.video import check_video
@@ -284,13 +254,10 @@ def check_frames(options: RenderOptions) -> None:
         raise RunError(f"--width must be a number of pixels from 1 to {MAX_WIDTH}, got {width}")
     if not (isinstance(orbit, int) and 0 <= orbit <= MAX_FRAMES):
         raise RunError(f"--orbit must be a number of frames from 1 to {MAX_FRAMES}, got {orbit}")
-    if video is None:
-        if options.fps != RenderOptions.fps:
-            raise RunError(f"fps={options.fps:g} needs --video")
-    else:
+    if video is not None:
         if not orbit:
             raise RunError("--video needs --orbit N, N >= 2")
-        check_video(video, options.fps, orbit)
+        check_video(video, FPS, orbit)
         check_writable(video)
 
 

@@ -21,13 +21,7 @@ from gs2d.data.reach import Reach
 from gs2d.data.subject_box import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import write_mesh, write_pieces
-from gs2d.io.run_dir import (
-    MESH,
-    PAGE,
-    SURFACE,
-    TEXTURED,
-    RunFolder,
-)
+from gs2d.io.run_dir import MESH, SURFACE, TEXTURED, RunFolder
 from gs2d.meshing.convex_pieces import convex_pieces, required
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.extract import Extraction, ExtractOptions
@@ -35,12 +29,10 @@ from gs2d.meshing.mesh_methods import MESH_METHODS, method_name
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
-from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_refine import refined
-from gs2d.pipeline.finish.run_report import report_again
+from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, within_reach
-from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.limits import release, release_buffers
 from gs2d.pipeline.prepare.loaded import RenderedScene, checked_output, open_finished
 from gs2d.pipeline.prepare.options import MeshOptions
@@ -331,10 +323,7 @@ def mesh_run(
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
             on_event(Notice(f"removed {TEXTURED}, which belonged to the previous mesh"))
-    if run.file(PAGE).exists():  # it shows the mesh
-        with attempted(PAGE, again("export", run.path, "--format", "html"), on_event):
-            page_run(run.path, on_event=on_event, loaded=loaded)
-    report_again(run, on_event)
+    show_again(run, on_event, loaded)
     return result
 
 

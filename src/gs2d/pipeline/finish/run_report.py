@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gs2d.core.camera import Camera
-from gs2d.io.run_dir import REPORT, RunFolder, open_run
-from gs2d.pipeline.attempts import again, attempted, reason_of
-from gs2d.pipeline.finish.run_images import shown_cameras
+from gs2d.io.run_dir import PAGE, REPORT, RunFolder, open_run
+from gs2d.pipeline.attempts import attempted_file, reason_of, remade_by
+from gs2d.pipeline.look.page import page_run
+from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.training.events import NotMade, OnEvent, ignore
 
 
@@ -17,19 +17,22 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
 
     run = open_run(Path(path))
     run.sweep()
-    command = again("evaluate", run.path)
 
     def failed(section: str, error: Exception) -> None:
-        on_event(NotMade(f"{section} in {REPORT}", reason_of(error), command, error))
+        on_event(NotMade(f"{section} in {REPORT}", reason_of(error), remade_by(run, REPORT), error))
 
-    cameras: list[Camera] = []
-    with attempted(f"cameras of the images in {REPORT}", command, on_event):
-        cameras = shown_cameras(run)
-    write_report(run.path, cameras=cameras, on_failure=failed)
-    return run.file(REPORT)
+    return write_report(run.path, on_failure=failed)
 
 
 def report_again(run: RunFolder, on_event: OnEvent) -> None:
     """Write the report again after a change; report failures as events."""
-    with attempted(REPORT, again("evaluate", run.path), on_event):
+    with attempted_file(run, REPORT, on_event):
         report_run(run.path, on_event)
+
+
+def show_again(run: RunFolder, on_event: OnEvent, loaded: LoadedRun | None = None) -> None:
+    """Write the report again after a change, and the page, if there is one; report failures as events."""
+    if run.file(PAGE).exists():
+        with attempted_file(run, PAGE, on_event):
+            page_run(run.path, on_event=on_event, loaded=loaded)
+    report_again(run, on_event)

@@ -17,7 +17,7 @@ from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh, write_mesh, written_files
-from gs2d.io.run_dir import MESH, PAGE, TEXTURED, RunFolder
+from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
 from gs2d.meshing.texture import (
     MAX_SIZE,
     MIN_SIZE,
@@ -29,12 +29,10 @@ from gs2d.meshing.texture import (
     texture_size,
     unwrap,
 )
-from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
-from gs2d.pipeline.finish.run_report import report_again
+from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.trusted_depth import usable_pixels
-from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
@@ -81,10 +79,7 @@ def texture_run(
     baked = textured_mesh(loaded, mesh, options, on_event)
     write_mesh(target, baked.mesh, up=up_direction([view.camera for view in loaded.scene.train]))
     if target.resolve() == run.file(TEXTURED).resolve():
-        if run.file(PAGE).exists():  # it shows the textured mesh
-            with attempted(PAGE, again("export", run.path, "--format", "html"), on_event):
-                page_run(run.path, on_event=on_event, loaded=loaded)
-        report_again(run, on_event)
+        show_again(run, on_event, loaded)
     return {
         "files": [str(file) for file in files],
         "faces": len(baked.mesh.faces),

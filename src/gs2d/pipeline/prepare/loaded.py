@@ -34,7 +34,6 @@ from gs2d.pipeline.prepare.scene_part import PartStart, TrainedPart
 from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.cached_objective import is_cacheable
 from gs2d.training.events import Notice, OnEvent, Phase, Step
 from gs2d.training.trainer import raster_settings
 
@@ -94,13 +93,10 @@ class LoadedRun:
         recipe = {name: value for name, value in facts["recipe"].items() if name not in ("name", "fused_depth")}
         if processes is None:
             processes = [(0, 0, self.processes)] if self.processes > 1 else []
-        views, stages = len(self.scene.train), self.recipe.stages[: index + 1]
-        caches = any(is_cacheable(self.recipe, stage, backend=self.backend, views=views) for stage in stages)
         facts |= {
             "recipe": {**recipe, "stages": recipe["stages"][: index + 1]},
             "scene": self.resolved.scene.digest,
             "downscale": None,  # part of the digest of the images
-            "stage2_cache_bytes": facts["stage2_cache_bytes"] if caches else 0,
             "versions": {name: versions()[name] for name in ("2dgs-r", "torch")},
             "processes": list(map(list, processes)),
         }
@@ -170,7 +166,6 @@ def prepare_run(
         downscale=capture.downscale,
         raster=raster_settings(capture.protocol, capture.scene.extent, recipe.sh_degree, recipe.mip_px),
         backend=capture.backend.facts(),
-        stage2_cache_bytes=options.stage2_cache_mb << 20,
         schedule_scale=scale,
         title=title,
         init=init_digest,

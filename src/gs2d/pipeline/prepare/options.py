@@ -145,8 +145,6 @@ class CommonTraining(Options):
     masked: Literal["ignore", "empty", "off"] | None = None
     """Meaning of black mask pixels: ignore (not used), empty (transparent), or off (masks are not used) (default:
     ignore, or by protocol)."""
-    stage2_cache_mb: Annotated[int, SETTING] = 1024
-    """Cache for views of stage 2 in MiB, about 5 MiB per view of 400x400 px; 0 disables it."""
 
     @property
     def learned(self) -> tuple[str, ...]:
@@ -303,9 +301,7 @@ class RenderOptions(Options):
     width: Annotated[int | None, Arg(metavar="PIXELS")] = None
     """Image width; the height follows (default: as in training)."""
     video: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """With --orbit: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
-    fps: Annotated[float, SETTING] = 30.0
-    """Frames per second of the video."""
+    """With --orbit: also write a video with 30 frames a second, .mp4 (H.264, needs ffmpeg) or .webp."""
 
 
 @dataclass(frozen=True, kw_only=True)

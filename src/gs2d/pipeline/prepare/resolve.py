@@ -111,8 +111,6 @@ def check_execution(options: TrainOptions) -> None:
     if options.downscale is not None and options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     checkpoint_interval(options.checkpoint_every)
-    if options.stage2_cache_mb < 0:
-        raise RecipeError(f"stage2_cache_mb must be a whole number >= 0, got {options.stage2_cache_mb}")
     check_subject_box(options.subject_box, {"--scene": options.whole_scene})
 
 

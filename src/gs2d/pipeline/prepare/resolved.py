@@ -97,8 +97,6 @@ class ResolvedRun:
     raster : RasterSettings
     backend : mapping
         What determines its results (``Backend.facts``).
-    stage2_cache_bytes : int
-        Memory for cached views; see ``Trainer``.
     schedule_scale : float
         Trained fraction of the full schedule.
     title : str
@@ -116,7 +114,6 @@ class ResolvedRun:
     downscale: int
     raster: RasterSettings
     backend: Mapping[str, Any]
-    stage2_cache_bytes: int
     schedule_scale: float = 1.0
     title: str = ""
     init: str | None = None
@@ -142,7 +139,7 @@ class ResolvedRun:
             "downscale": self.downscale,
             "scene": {"masks": data["scene"]["masks"], "digest": self.scene.digest},
             "raster": data["raster"],
-            **{name: data[name] for name in ("stage2_cache_bytes", "init", "part")},
+            **{name: data[name] for name in ("init", "part")},
         }
 
 

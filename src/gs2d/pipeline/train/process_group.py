@@ -129,7 +129,6 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
         backend=loaded.backend,
         options=TrainerOptions(
             progress_every=progress_every(loaded),
-            stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
             processes=together,
         ),
     )

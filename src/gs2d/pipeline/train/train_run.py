@@ -14,7 +14,6 @@ from gs2d.io.run_dir import (
     EDITS,
     MESH,
     PAGE,
-    REPORT,
     SPLATS,
     VERDICT,
     RunFolder,
@@ -24,9 +23,9 @@ from gs2d.io.run_dir import (
     make_folder,
     remove_made,
 )
-from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.attempts import again, attempted_file
 from gs2d.pipeline.finish.run_mesh import extract_mesh, keep_facts
-from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
@@ -213,7 +212,6 @@ def train_stages(
             within=None if part is None or loaded.recipe.dense_start is None else part.within,
             exposures=None if part is None else part.exposures,
             progress_every=progress_every(loaded),
-            stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
             processes=together,
         ),
     )
@@ -266,15 +264,14 @@ def finish(run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent,
     """Write mesh, page, verdict and report of a run; a failure of one does not prevent the others."""
     execution = loaded.resolved.execution
     mesh = MeshOptions(subject_box=execution.subject_box, whole_scene=execution.whole_scene)
-    with attempted(MESH, again("mesh", run.path), on_event):
+    with attempted_file(run, MESH, on_event):
         subject = meshed_subject(run, loaded, splats, mesh, on_event)
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
             keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject))
     if execution.page and not run.file(PAGE).exists():
-        with attempted(PAGE, again("export", run.path, "--format", "html"), on_event):
+        with attempted_file(run, PAGE, on_event):
             page_run(run.path, on_event=on_event, loaded=loaded)
-    with attempted(VERDICT, again("evaluate", run.path), on_event):
+    with attempted_file(run, VERDICT, on_event):
         write_verdict(run, loaded, collected)
     on_event(Phase("writing the report", 0))  # last: it links to the others
-    with attempted(REPORT, again("evaluate", run.path), on_event):
-        report_run(run.path, on_event)
+    report_again(run, on_event)

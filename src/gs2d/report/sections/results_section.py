@@ -11,7 +11,6 @@ from markupsafe import Markup
 from gs2d.config.grades import TRANSPARENT
 from gs2d.report.html_parts import macro, missing
 from gs2d.report.run_record import RunRecord, number
-from gs2d.report.sections.glossary import titles_of
 from gs2d.report.sections.section_registry import register_section
 
 _SPLITS = {
@@ -51,8 +50,7 @@ def results_section(run: RunRecord) -> str | None:
         if any(value is not None for value in values):
             rows.append([label, *(figure(value, digits) for value in values)])
     columns = ["", *(_stage_name(stage) for stage in run.stages)]
-    titles = titles_of([row[0] for row in rows])
-    return macro("macros.html", "table", columns, rows, titles=titles, best=best) + _transparent(run)
+    return macro("macros.html", "table", columns, rows, best=best) + _transparent(run)
 
 
 def _transparent(run: RunRecord) -> Markup:

@@ -11,7 +11,6 @@ from gs2d.report.run_record import RunRecord
 Section = Callable[[RunRecord], str | None]
 """Returns the HTML of a section, or None where it has nothing to show; its attribute `title` is the heading."""
 
-GLOSSARY = "terms"  # the last section
 _BUILTIN = (  # in the order of the page; each is a module of this package
     *("verdict", "results", "views", "training", "capture"),
     *("learned", "files", "settings"),
@@ -19,13 +18,10 @@ _BUILTIN = (  # in the order of the page; each is a module of this package
 SECTIONS: Registry[Section] = Registry(
     "report section",
     "gs2d.sections",
-    builtin={
-        **{name: f"gs2d.report.sections.{name}_section" for name in _BUILTIN},
-        GLOSSARY: "gs2d.report.sections.glossary",
-    },
+    builtin={name: f"gs2d.report.sections.{name}_section" for name in _BUILTIN},
     error=RunError,
 )
-"""Names of sections, in the order of the page; those of contrib and of packages follow, then the glossary."""
+"""Names of sections, in the order of the page; those of contrib and of packages follow."""
 
 
 def register_section(name: str, *, title: str) -> Callable[[Section], Section]:
