@@ -41,7 +41,6 @@ from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import DataError
 from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
-from gs2d.pipeline.prepare.run_appearance import matched_by_halves
 from gs2d.training.events import ignore
 
 OWN_ITERATIONS = 30_000
@@ -307,9 +306,8 @@ def draw_test_views(
 
 
 def score_images(job: LoadedRun, files: Sequence[Path]) -> dict[str, Any]:
-    """Return our metrics of test view images, unchanged and with matched colours."""
+    """Return our metrics of test view images."""
     plain: dict[str, ImageMetrics] = {}
-    matched: dict[str, ImageMetrics] = {}
     background = job.settings.background
     for view, file in zip(job.scene.test, files, strict=True):
         image = torch.from_numpy(np.asarray(Image.open(file).convert("RGB"), dtype=np.float32) / 255)
@@ -317,9 +315,7 @@ def score_images(job: LoadedRun, files: Sequence[Path]) -> dict[str, Any]:
         pixels = view.mask()
         mask = None if pixels is None else torch.from_numpy(pixels)
         plain[view.name] = image_metrics(image, target, mask, backend=job.backend)
-        image = matched_by_halves(view, image, target, mask, background)
-        matched[view.name] = image_metrics(image, target, mask, backend=job.backend)
-    return {"test": summary_of(plain), "test_matched": summary_of(matched)}
+    return {"test": summary_of(plain)}
 
 
 def measure_peer(

@@ -36,7 +36,7 @@ from gs2d.meshing.evidence import gather, pixels
 from gs2d.pipeline.finish.run_images import render_view
 from gs2d.pipeline.finish.run_mesh import fusion_frame
 from gs2d.pipeline.finish.run_subject import sights, surface_reach
-from gs2d.pipeline.finish.scoring import ScoreOptions, score_views
+from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import FEW
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
@@ -216,7 +216,7 @@ def summary_of(scores: Mapping[str, ImageMetrics]) -> dict[str, Any] | None:
 
 
 def score_run(path: Path) -> dict[str, Any]:
-    """Return scores of a run's splats: both splits, with matched colours, and hidden sparse points of test views.
+    """Return scores of a run's splats: both splits, and hidden sparse points of test views.
 
     Test views use the exposure predicted from neighbouring training images, as in the run's own scores, and none in
     "test_plain".
@@ -225,13 +225,12 @@ def score_run(path: Path) -> dict[str, Any]:
     drawing = (job.settings, job.backend)
     scene = with_predicted(job.scene, metered(splats, *drawing))
 
-    def scores(views: Sequence[View], **how: Any) -> dict[str, Any] | None:
-        return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, options=ScoreOptions(**how)))
+    def scores(views: Sequence[View]) -> dict[str, Any] | None:
+        return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore))
 
     return {
         "test": scores(scene.test),
         "test_plain": scores(job.scene.test),
-        "test_matched": scores(job.scene.test, match=True),
         "train": scores(scene.train),
         "hidden": hidden_fraction(job, splats),
         "splats": len(splats),

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gs2d.data import View
 from gs2d.errors import RunError
 from gs2d.evaluation.evaluators import check_thresholds, choose_truth, score_surface
-from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.evaluation.lpips import load_lpips
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, SURFACE, VERDICT
@@ -20,7 +17,6 @@ from gs2d.pipeline.finish.scoring import ScoreOptions, score_views, split_metric
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_poses import aligned
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
 
 
@@ -50,19 +46,11 @@ def evaluate_run(
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     drawing = (loaded.settings, loaded.backend)
 
-    def scores_of(views: Sequence[View], name: str, **how: Any) -> dict[str, ImageMetrics]:
-        chosen = ScoreOptions(lpips=lpips, **how)
-        return score_views(splats, views, *drawing, name=name, on_event=on_event, options=chosen)
-
-    if "exposure" in options.matched:
-        scores = scores_of(loaded.scene.test, "scoring test views, colours matched", match=True)
-        result |= split_metrics(scores, "test_matched", "test")
-    if "poses" in options.matched:
-        best = tuple(aligned(splats, loaded.scene.test, *drawing, loaded.scene.extent, on_event))
-        result |= split_metrics(scores_of(best, "scoring test views, cameras aligned"), "test_aligned", "test")
     scene, collected = with_predicted(loaded.scene, metered(splats, *drawing)), Collector(loaded.scene)
     for split, views in (("train", scene.train), ("test", scene.test)):
-        scores = scores_of(views, f"scoring {split} views", split=split, visitors=[collected.visit])
+        chosen = ScoreOptions(lpips=lpips, split=split, visitors=[collected.visit])
+        name = f"scoring {split} views"
+        scores = score_views(splats, views, *drawing, name=name, on_event=on_event, options=chosen)
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
     if truth is not None and has_mesh:

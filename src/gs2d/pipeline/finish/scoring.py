@@ -14,7 +14,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics, mean_metrics, psnr_float
 from gs2d.evaluation.lpips import Lpips
-from gs2d.pipeline.prepare.run_appearance import matched_by_halves, photographed
+from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -92,14 +92,11 @@ class ScoreOptions:
     split : str
         Passed to ``visitors``.
     lpips : Lpips or None
-    match : bool
-        Match colours by :func:`~gs2d.pipeline.prepare.run_appearance.matched_by_halves`.
     visitors : sequence of Visitor
     """
 
     split: str = ""
     lpips: Lpips | None = None
-    match: bool = False
     visitors: Sequence[Visitor] = ()
 
 
@@ -146,18 +143,15 @@ def _rendered(
         target = torch.from_numpy(view.target(settings.background)).to(output.color)
         pixels = view.mask()
         mask = None if pixels is None else torch.from_numpy(pixels).to(target.device)
-        if options.match:
-            image = matched_by_halves(view, output.color, target, mask, settings.background)
-        else:
-            image = photographed(view, output.color, settings.background)
+        image = photographed(view, output.color, settings.background)
         yield RenderedPhotograph(view, options.split, output, image, target, mask)
 
 
-def split_metrics(scores: dict[str, ImageMetrics], name: str, split: str | None = None) -> dict[str, Any]:
-    """Return ``{name: means}``, or null with the reason if the scene has no views of ``split`` (default: ``name``)."""
+def split_metrics(scores: dict[str, ImageMetrics], split: str) -> dict[str, Any]:
+    """Return ``{split: means}``, or null with the reason if the scene has no such views."""
     if not scores:
-        return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
-    return {name: mean_metrics(list(scores.values())).to_json()}
+        return {split: None, f"{split}_reason": f"the scene has no {split} views"}
+    return {split: mean_metrics(list(scores.values())).to_json()}
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
