@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 import torch
 
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
-from gs2d.data.scene import View
-from gs2d.pipeline.finish.scoring import ScoreOptions, TransparentPixels, mean_psnr, score_views
+from gs2d.data.scene import Scene, View
+from gs2d.pipeline.finish.run_verdict import Collector
+from gs2d.pipeline.finish.scoring import ScoreOptions, mean_psnr, score_views
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 
@@ -69,12 +73,12 @@ def test_transparent_pixels_are_counted_where_training_photographs_are_opaque_an
     every, half = float(clear.mean()), float(clear[:, :6].mean())
     assert 0 < half != every
     for split in ("train", "test"):
-        counter = TransparentPixels()
+        counter = Collector(cast(Scene, SimpleNamespace(observed=lambda **_: None)))
         options = ScoreOptions(split=split, visitors=[counter.visit])
         score_views(wall, views, settings, backend, name="", on_event=lambda _: None, options=options)
         if split == "test":
-            assert counter.entry() == {}
+            assert counter.transparent() == {}
             continue
         worst, view = max((every, "all"), (half, "left"))
         expected = {"part": pytest.approx((every + half) / 2), "view": view, "worst": pytest.approx(worst)}
-        assert counter.entry() == {"transparent": expected}
+        assert counter.transparent() == {"transparent": expected}

@@ -102,7 +102,7 @@ def test_a_resume_with_other_photographs_is_an_error(
     out, photos = started(room, tmp_path), tmp_path / "photos"
     shutil.copytree(room.photos, photos)
     assert run(words_for(photos, out, "--resume", "--quiet")) == 2
-    assert f"was made from {room.photos}, not from {photos}" in one_line(capsys.readouterr().err)
+    assert "was made with other options (photos: " in one_line(capsys.readouterr().err)
     poses = json.loads((out / "capture" / "poses.json").read_text())
     (out / "capture" / "poses.json").write_text(json.dumps({**poses, "photos": str(photos)}))
     (photos / "003.jpg").rename(photos / "new.jpg")

@@ -17,11 +17,11 @@ from gs2d.pipeline.prepare.options import (
     PosesOptions,
     ReconstructOptions,
     RenderOptions,
+    Resources,
     TextureOptions,
     TrainOptions,
 )
 
-MemoryOption = Annotated[float | None, Arg(metavar="GIB")]
 RunPath = Annotated[Path, Arg(metavar="RUN", positional=True)]
 
 
@@ -81,7 +81,7 @@ class TrainCommand(TrainOptions, Common):
     first=("run", "out", "texture", "method", "refine", "voxel", "bbox"),
 )
 @dataclass(frozen=True, kw_only=True)
-class MeshCommand(TextureOptions, MeshOptions, Common):
+class MeshCommand(TextureOptions, MeshOptions, Resources, Common):
     """Extract the mesh of a run again, with other settings; or that of a file of splats."""
 
     run: Annotated[Path | None, Arg(metavar="RUN", positional=True)] = None
@@ -95,8 +95,6 @@ class MeshCommand(TextureOptions, MeshOptions, Common):
     texture: bool = False
     """Write a textured mesh, as .glb or .obj, from the photographs. Without options that change the mesh, uses
     mesh.ply."""
-    memory: MemoryOption = None
-    """Memory limit in GiB (default: half of the memory of this machine or container)."""
     threads: int | None = None
     """CPU threads."""
 
@@ -108,7 +106,7 @@ class MeshCommand(TextureOptions, MeshOptions, Common):
     first=("run", "split", "orbit", "width", "video", "out"),
 )
 @dataclass(frozen=True, kw_only=True)
-class RenderCommand(RenderOptions, Common):
+class RenderCommand(RenderOptions, Resources, Common):
     """Render images or a video of a run."""
 
     run: RunPath
@@ -117,8 +115,6 @@ class RenderCommand(RenderOptions, Common):
     """Folder of the images (default: renders/SPLIT or renders/orbit in the run)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Use the splats of this file, in the frame of the run. Needs --out."""
-    memory: MemoryOption = None
-    """Memory limit in GiB (default: half of the memory of this machine or container)."""
     threads: int | None = None
     """CPU threads."""
 
@@ -141,13 +137,11 @@ class ViewCommand(Common):
     first=("run", "ground_truth", "lpips_weights"),
 )
 @dataclass(frozen=True, kw_only=True)
-class EvaluateCommand(EvaluateOptions, Common):
+class EvaluateCommand(EvaluateOptions, Resources, Common):
     """Score images (PSNR, SSIM, LPIPS) and the mesh of a run."""
 
     run: RunPath
     """Run folder."""
-    memory: MemoryOption = None
-    """Memory limit in GiB (default: half of the memory of this machine or container)."""
     threads: int | None = None
     """CPU threads."""
 

@@ -38,6 +38,7 @@ from gs2d.pipeline.prepare.pose_finding import (
     requested_options,
 )
 from gs2d.pipeline.prepare.resolve import check_options
+from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.sfm.colmap_process import check_installed
 from gs2d.sfm.photos import find_photos
@@ -187,21 +188,21 @@ def _claimed(out: Path) -> Iterator[None]:
 def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
     """Return the contents of ``poses.json``; raise RunError if other photographs or options made it."""
     poses, requested = read_json(capture / POSES_JSON), requested_options(poses_options(options))
-    remedy = "resume with the same, or start again with --overwrite"
     try:
-        if poses["photos"] != str(options.photos.resolve()):
-            raise RunError(f"{capture} was made from {poses['photos']}, not from {options.photos}; {remedy}")
-        for name, value in requested.items():
-            if (old := poses["requested"][name]) != value:
-                raise RunError(f"{capture} was made with --{name.replace('_', '-')} {old}, now {value}; {remedy}")
+        made = {"photos": poses["photos"], **poses["requested"]}
+        wanted = {"photos": str(options.photos.resolve()), **requested}
+        if made != wanted:
+            raise RunError(
+                f"{capture} was made with other options{difference(made, wanted)}; resume with the same, or start "
+                "again with --overwrite"
+            )
         if options.photos.is_dir():  # it is no longer needed and may be gone
             old = {row["source"] for row in poses["photographs"]}
             now = {path.relative_to(options.photos).as_posix() for path in find_photos(options.photos)[0]}
-            for name in sorted(old ^ now)[:1]:
-                what = "is new in" if name in now else "is missing from"
-                raise RunError(
-                    f"{name} {what} {options.photos} since the cameras were estimated; start again with --overwrite"
-                )
+            if old != now:
+                name = min(old ^ now)
+                what = f"{name} is {'new in' if name in now else 'missing from'} {options.photos}"
+                raise RunError(f"{what} since the cameras were estimated; start again with --overwrite")
         placed_line(poses)
         lost_lines(poses)
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:

@@ -17,8 +17,8 @@ from gs2d.core.atomic_files import atomic_write
 from gs2d.data.arrays import read_npz
 from gs2d.errors import DataError, RunError
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.prepare.scene_part import PartStart
 from gs2d.training.start.initialize import splats_as_start
+from gs2d.training.trainer import TrainerOptions
 
 ABSENT, FROZEN, OWN = 0, 1, 2  # of a row of the splats that were trained before
 
@@ -48,8 +48,8 @@ def read_start(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 def load_start(
     splats_file: Path, start_file: Path, recipe: Recipe, region: tuple[tuple[Any, ...], ...] = ()
-) -> PartStart:
-    """Return the initial state of a block.
+) -> dict[str, Any]:
+    """Return the initial state of a block, as fields of ``TrainedPart``.
 
     Parameters
     ----------
@@ -74,8 +74,10 @@ def load_start(
         exposures = torch.from_numpy(np.ascontiguousarray(saved, np.float32))
         digest.update(exposures.numpy().tobytes())
     digest.update(repr(region).encode() if region else b"")
-    kinds, within = torch.from_numpy(rows), partial(inside, region) if region else None
-    return PartStart(splats.rows(kinds == OWN), splats.rows(kinds == FROZEN), exposures, digest.hexdigest(), within)
+    kinds = torch.from_numpy(rows)
+    within = partial(inside, region) if region and recipe.dense_start is not None else None
+    options = TrainerOptions(frozen=splats.rows(kinds == FROZEN), exposures=exposures, within=within)
+    return {"own": splats.rows(kinds == OWN), "options": options, "digest": digest.hexdigest()}
 
 
 def inside(region: tuple[tuple[Any, ...], ...], points: Tensor) -> Tensor:

@@ -168,8 +168,8 @@ class BlockTask(BlocksTask):
             recipe=recipe,
             protocol=self.protocol(),
             views=block.views,
-            start=load_start(coarse_folder(out) / SPLATS, start, recipe, region),
             extent=block.extent if partition.extent == "block" else None,
+            **load_start(coarse_folder(out) / SPLATS, start, recipe, region),
         )
         run = self.train(part, block_folder(out, self.block), on_event)
         return {"stages": run.metrics()["stages"]}
@@ -200,7 +200,7 @@ class SeamsTask(BlocksTask):
                 recipe=recipe,
                 protocol=settled.protocol,
                 views=views,
-                start=load_start(out / MERGED, start, recipe),
+                **load_start(out / MERGED, start, recipe),
             )
             self.train(part, seam_folder(out), on_event)
         return {"splats": write_result(settled, self.options, partition, on_event)}

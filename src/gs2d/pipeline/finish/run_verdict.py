@@ -37,6 +37,7 @@ HEADLINES: Mapping[str | None, str] = {
 UNCHECKED = "The training photographs are reproduced {}; new views were not checked."
 NOT_MEASURED = "not measured"
 OPAQUE = 0.5  # alpha; above, a pixel shows a surface
+CLEAR = 0.9  # alpha; below, more than a tenth of the colour is background
 SPREAD_DEPTH = 0.05  # of the mean depth; the depth that hides a sparse point (evaluation/hidden_points.py)
 
 
@@ -54,6 +55,8 @@ class ViewMeasures:
         Sparse points visible in a test view, and how many of them its rendering hides.
     spread : float or None
         Share of the opaque pixels along which the splats lie at different depths (:func:`spread_pixels`).
+    transparent : float or None
+        Share of the pixels in which the background shows through, of a training view without alpha channel.
     """
 
     name: str
@@ -62,6 +65,7 @@ class ViewMeasures:
     points: int | None = None
     hidden: int | None = None
     spread: float | None = None
+    transparent: float | None = None
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,14 @@ class Collector:
         """Return the views measured so far."""
         return tuple(self._views.values())
 
+    def transparent(self) -> dict[str, Any]:
+        """Return ``{"transparent": ...}`` for ``metrics.json``: the mean share, the worst view and its share."""
+        shares = {view.name: view.transparent for view in self.views if view.transparent is not None}
+        if not shares:
+            return {}
+        worst = max(shares, key=shares.__getitem__)
+        return {"transparent": {"part": fmean(shares.values()), "view": worst, "worst": shares[worst]}}
+
     def visit(self, seen: RenderedPhotograph, scores: ImageMetrics) -> None:
         """Measure a view."""
         if self.failure is not None:
@@ -115,6 +127,9 @@ class Collector:
         view, psnr = seen.view, scores.psnr.value
         psnr = psnr if psnr is not None and math.isfinite(psnr) else None
         measured = ViewMeasures(view.name, seen.split, psnr, spread=spread_pixels(seen.output))
+        if seen.split == "train" and view.alpha() is None:
+            alpha = seen.output.alpha if seen.mask is None else seen.output.alpha[seen.mask]
+            return replace(measured, transparent=float((alpha < CLEAR).double().mean()) if alpha.numel() else None)
         if seen.split != "test" or self._observed is None:
             return measured
         points = self._observed.in_view(view.name, view.camera)

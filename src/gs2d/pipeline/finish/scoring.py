@@ -52,37 +52,6 @@ Visitor = Callable[[RenderedPhotograph, ImageMetrics], None]
 """Receives each view with its scores; must not keep the images."""
 
 
-class TransparentPixels:
-    """Visitor that counts the pixels of training views in which the background shows through.
-
-    Views whose photograph has an alpha channel are left out, and so are masked pixels.
-    """
-
-    CLEAR = 0.9  # alpha; below, more than a tenth of the colour is background
-
-    def __init__(self) -> None:
-        self._shares: dict[str, float] = {}
-
-    def visit(self, seen: RenderedPhotograph, scores: ImageMetrics) -> None:
-        """Count the pixels of a view."""
-        if seen.split != "train" or seen.view.alpha() is not None:
-            return
-        alpha = seen.output.alpha if seen.mask is None else seen.output.alpha[seen.mask]
-        if alpha.numel():
-            self._shares[seen.view.name] = float((alpha < self.CLEAR).double().mean())
-
-    def entry(self) -> dict[str, Any]:
-        """Return ``{"transparent": ...}`` for ``metrics.json``, or {} if no view was counted.
-
-        ``part`` is the mean share over the views; ``view`` is the view with the largest share, ``worst``.
-        """
-        if not self._shares:
-            return {}
-        worst = max(self._shares, key=self._shares.__getitem__)
-        part = sum(self._shares.values()) / len(self._shares)
-        return {"transparent": {"part": part, "view": worst, "worst": self._shares[worst]}}
-
-
 @dataclass(frozen=True, kw_only=True)
 class ScoreOptions:
     """How views are scored.

@@ -6,7 +6,7 @@ import hashlib
 import json
 import typing
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +30,12 @@ from gs2d.pipeline.prepare.resolve import check_execution, check_options, resolv
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
 from gs2d.pipeline.prepare.run_poses import with_refined_poses
-from gs2d.pipeline.prepare.scene_part import PartStart, TrainedPart
+from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.events import Notice, OnEvent, Phase, Step
-from gs2d.training.trainer import raster_settings
+from gs2d.training.trainer import TrainerOptions, raster_settings
 
 DECODE_THREADS = 2
 
@@ -51,8 +51,8 @@ class LoadedRun:
     backend : Backend
     init : Splats or None
         Initial splats; None: from points.
-    start : PartStart or None
-        Initial state, for a part of a scene.
+    options : TrainerOptions
+        Further inputs of the trainer, for a part of a scene.
     processes : int
         Number of processes that train together.
     """
@@ -61,7 +61,7 @@ class LoadedRun:
     scene: Scene
     backend: Backend
     init: Splats | None = None
-    start: PartStart | None = None
+    options: TrainerOptions = field(default_factory=TrainerOptions)
     processes: int = 1
 
     @property
@@ -144,6 +144,7 @@ def prepare_run(
         check_execution(options)
         options = replace(options, protocol=part.protocol, test_every=None)
     init, init_digest = (None, None) if options.init is None else read_init(options.init, on_event)
+    init = init if part is None else part.own
     capture = open_capture(options, on_event)
     scene = capture.scene if part is None else part.scene_of(capture.scene)
     missing = missing_lines(options.scene)
@@ -158,7 +159,6 @@ def prepare_run(
     else:
         recipe = validate(part.recipe)
         capture = replace(capture, scene=without_masked_points(scene, capture.protocol, on_event))
-    start = None if part is None else part.start
     resolved = ResolvedRun(
         recipe=recipe,
         protocol=capture.protocol,
@@ -169,10 +169,11 @@ def prepare_run(
         schedule_scale=scale,
         title=title,
         init=init_digest,
-        part=None if start is None else start.digest,
+        part=None if part is None else part.digest,
         execution=Execution(**values(Execution, options)),
     )
-    return LoadedRun(resolved, capture.scene, capture.backend, init, start)
+    further = TrainerOptions() if part is None else part.options
+    return LoadedRun(resolved, capture.scene, capture.backend, init, further)
 
 
 def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:

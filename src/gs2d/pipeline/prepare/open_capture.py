@@ -182,19 +182,10 @@ def _downscale_of_resumed(options: TrainOptions) -> int | None:
 
 
 def _skipped_line(scene: Scene) -> str:
-    """Return one line about skipped photographs: how many, and which for each reason."""
-    reasons: dict[str, list[tuple[str, str]]] = {}
-    for line in scene.skipped:
-        name, _, reason = line.partition(": ")
-        reasons.setdefault(reason.partition("; ")[0], []).append((name, reason))
-    parts = []
-    for skipped in reasons.values():
-        names = ", ".join(name for name, _ in skipped[:SHOWN_SKIPS])
-        more = f" and {len(skipped) - SHOWN_SKIPS} more" if len(skipped) > SHOWN_SKIPS else ""
-        parts.append(f"{names}{more}: {skipped[0][1]}")
-    used = len({view.path or view.name for view in scene.views})
+    """Return one line about skipped photographs: how many, and the first with their reasons."""
+    used, more = len({view.path or view.name for view in scene.views}), len(scene.skipped) > SHOWN_SKIPS
     count = f"{len(scene.skipped)} of {len(scene.skipped) + used} photographs are left out"
-    return f"{count} (`gs2d info` lists them): {'; '.join(parts)}"
+    return f"{count} (`gs2d info` lists them): {'; '.join(scene.skipped[:SHOWN_SKIPS])}{' ...' if more else ''}"
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------

@@ -2,41 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-
-from torch import Tensor
+from dataclasses import dataclass, field, replace
 
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
 from gs2d.core.splats import Splats
 from gs2d.data import Scene
 from gs2d.errors import DataError
-
-
-@dataclass(frozen=True, eq=False)
-class PartStart:
-    """The initial state of a part.
-
-    Attributes
-    ----------
-    own : Splats
-        The splats that are trained.
-    frozen : Splats
-        Rendered with them, never changed.
-    exposures : Tensor [V, 3, 4] or None
-        Of the training views, if the recipe learns exposures.
-    digest : str
-        Hash of the above.
-    within : callable or None
-        For a dense start: returns whether points [M, 3] belong to the part, [M] bool.
-    """
-
-    own: Splats
-    frozen: Splats
-    exposures: Tensor | None
-    digest: str
-    within: Callable[[Tensor], Tensor] | None = None
+from gs2d.training.trainer import TrainerOptions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,17 +22,23 @@ class TrainedPart:
     protocol : Protocol
     views : tuple of str
         Names of the training views, without test views; (): the split of the capture.
-    start : PartStart or None
-        None: initialised from points.
     extent : float or None
         World units; None: that of the capture.
+    own : Splats or None
+        The splats that are trained; None: initialised from points.
+    options : TrainerOptions
+        The frozen splats around them, the region of a dense start, and given exposures.
+    digest : str or None
+        Hash of ``own`` and ``options``.
     """
 
     recipe: Recipe
     protocol: Protocol
     views: tuple[str, ...] = ()
-    start: PartStart | None = None
     extent: float | None = None
+    own: Splats | None = None
+    options: TrainerOptions = field(default_factory=TrainerOptions)
+    digest: str | None = None
 
     def scene_of(self, scene: Scene) -> Scene:
         """Return the scene with the views and the extent of the part."""

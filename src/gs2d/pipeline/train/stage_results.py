@@ -6,9 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from gs2d.config.grades import TRANSPARENT
 from gs2d.config.recipe import Stage
-from gs2d.data import Scene, View
+from gs2d.data import Scene
 from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
@@ -17,7 +16,6 @@ from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import (
     ScoreOptions,
-    TransparentPixels,
     Visitor,
     mean_psnr,
     score_views,
@@ -28,7 +26,7 @@ from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_appearance import write_appearance
 from gs2d.pipeline.prepare.run_poses import write_poses
 from gs2d.pipeline.train.resume import put_in_cache
-from gs2d.training.events import Notice, OnEvent, StageScored
+from gs2d.training.events import OnEvent, StageScored
 from gs2d.training.trainer import Trainer
 
 PROBE_VIEWS = 4
@@ -52,16 +50,15 @@ class StageResults:
     ) -> None:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
         self._collected = collected
-        self._shown = choose_views(loaded.scene)
-        probes = loaded.scene.test or loaded.scene.train
-        self._probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
         self._predicted: tuple[tuple[int, int], Scene] | None = None  # with its stage and step
 
     def probe_psnr(self) -> float | None:
         """Return the mean PSNR of a few fixed views, test views if there are any."""
         # Exposures are predicted from neighbours only: measuring brightness would render every photograph.
-        views, loaded = self._now(self._probes, with_predicted(self._trainer.scene_now())), self._loaded
-        return mean_psnr(self._trainer.drawn, views, loaded.settings, loaded.backend)
+        scene = with_predicted(self._trainer.scene_now())
+        probes = scene.test or scene.train
+        probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
+        return mean_psnr(self._trainer.drawn, probes, self._loaded.settings, self._loaded.backend)
 
     def score(self, index: int, facts: Mapping[str, Any]) -> None:
         """Score and draw a finished stage; ``facts`` go into its entry. After the last stage, errors are reported."""
@@ -109,20 +106,14 @@ class StageResults:
             "bytes": splats.nbytes,
             **facts,
         }
-        transparent = TransparentPixels()
-        for split, views in (("train", self._loaded.scene.train), ("test", self._loaded.scene.test)):
+        collected = self._collected if last else None
+        for split in ("train", "test"):
             entry |= {split: None, f"{split}_reason": "its views could not be scored"}
             with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
-                visitors = [transparent.visit]
-                visitors += [self._collected.visit] if last and self._collected is not None else []
-                scores = self._score(split, views, visitors)
+                scores = self._score(split, [] if collected is None else [collected.visit])
                 del entry[f"{split}_reason"]
                 entry |= split_metrics(scores, split)
-        entry |= transparent.entry()
-        part = entry.get("transparent", {}).get("part", 0.0)
-        if last and part > TRANSPARENT:
-            text = f"{100 * part:.1f} % of the pixels of training views are transparent (alpha below 0.9)"
-            self._on_event(Notice(text, detail=True))
+        entry |= {} if collected is None else collected.transparent()
         self._draw(stage.name)
         stages = [*self._run.metrics()["stages"][:index], entry]
         self._run.write_metrics({"stages": stages, "surface": None})
@@ -132,19 +123,18 @@ class StageResults:
             put_in_cache(cache, self._run, index, load_tensors(saved.path))
         self._on_event(StageScored(entry))
 
-    def _score(self, split: str, views: Sequence[View], visitors: Sequence[Visitor]) -> dict[str, ImageMetrics]:
-        views, loaded = self._now(views, self._shown_scene()), self._loaded
+    def _score(self, split: str, visitors: Sequence[Visitor]) -> dict[str, ImageMetrics]:
+        scene, loaded = self._shown_scene(), self._loaded
+        views = scene.train if split == "train" else scene.test
         options = ScoreOptions(split=split, visitors=visitors)
         drawing, name = (loaded.settings, loaded.backend), f"scoring {split} views"
         return score_views(self._trainer.drawn, views, *drawing, name=name, on_event=self._on_event, options=options)
 
     def _draw(self, stage: str) -> None:
         drawn, state = self._trainer.drawn, self._trainer.state
-        views = self._now([view for _, view in self._shown], self._shown_scene())
-        shown = zip((split for split, _ in self._shown), views, strict=True)
         with attempted(f"images of stage {stage}", None, self._on_event):
             group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # no frozen splats
-            draw_stage(self._run, self._loaded, list(shown), stage, drawn, group)
+            draw_stage(self._run, self._loaded, choose_views(self._shown_scene()), stage, drawn, group)
 
     def _shown_scene(self) -> Scene:
         """Return the scene with its learned appearance, and predicted exposures of its test views."""
@@ -153,11 +143,6 @@ class StageResults:
             brightness = metered(self._trainer.drawn, self._loaded.settings, self._loaded.backend)
             self._predicted = (at, with_predicted(self._trainer.scene_now(), brightness))
         return self._predicted[1]
-
-    def _now(self, views: Sequence[View], scene: Scene) -> list[View]:
-        """Return the views of ``scene`` that correspond to views of the capture."""
-        now = dict(zip(map(id, self._loaded.scene.views), scene.views, strict=True))
-        return [now.get(id(view), view) for view in views]
 
     def _is_last(self, index: int) -> bool:
         return index == len(self._loaded.recipe.stages) - 1

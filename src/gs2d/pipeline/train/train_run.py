@@ -41,6 +41,7 @@ from gs2d.pipeline.train.resume import ResumePoint, choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, TrainingEvent, ignore
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
+from gs2d.training.trainer import Trainer
 from gs2d.viewer.page_server import free_port
 
 
@@ -187,9 +188,6 @@ def train_stages(
 
     The splats are written before they are scored. ``collected`` measures every view of the finished splats.
     """
-    from gs2d.training.trainer import Trainer, TrainerOptions
-
-    part, from_nothing = loaded.start, start.state is None
 
     def listen(event: TrainingEvent) -> None:
         recorder.on_training_event(event)
@@ -205,12 +203,10 @@ def train_stages(
         backend=loaded.backend,
         on_event=listen,
         state=start.state,
-        init=None if not from_nothing else loaded.init if part is None else part.own,
-        options=TrainerOptions(
+        init=loaded.init if start.state is None else None,
+        options=replace(
+            loaded.options,
             between=lambda: recorder.stop_if_requested(),
-            frozen=None if part is None else part.frozen,
-            within=None if part is None or loaded.recipe.dense_start is None else part.within,
-            exposures=None if part is None else part.exposures,
             progress_every=progress_every(loaded),
             processes=together,
         ),
