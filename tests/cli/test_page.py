@@ -48,7 +48,6 @@ def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytes
     [
         (["nowhere"], "folder"),
         (["cloud.ply", "--out", "cloud.png"], ".html file"),
-        (["cloud.ply", "--set", "sh_degree=4"], "sh_degree must be 0, 1, 2 or 3, got 4"),
         (["cloud.ply", "--bbox", *"0 0 0 1 1 1".split()], "leave them out"),
     ],
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from gs2d.cli.command_registry import BEGIN, LOOK, MEASURE, STEPS, register_command
-from gs2d.config.arguments import SETTING, Arg
+from gs2d.config.arguments import Arg
 from gs2d.pipeline.prepare.options import (
     BoxOption,
     EditOptions,
@@ -161,8 +161,6 @@ class ExportCommand(Common):
     --out; .ply is 3dgs)."""
     bbox: BoxOption = None
     """Export only splats whose centre is in this box. `gs2d view` shows its numbers."""
-    sh_degree: Annotated[int, SETTING] = 3
-    """With html: degree of the view-dependent colours, 0 to 3. Lower is smaller: 32 to 80 bytes per splat."""
 
 
 @register_command("edit", action="gs2d.cli.handlers:edit", group=LOOK)

@@ -163,7 +163,7 @@ def _export_page(command: c.ExportCommand, console: Console) -> None:
 
     if command.format not in (None, "html") or command.bbox is not None:
         raise RunError("an .html page takes neither another --format nor --bbox; leave them out")
-    result = page_run(command.run, command.out, sh_degree=command.sh_degree, on_event=console.on_event)
+    result = page_run(command.run, command.out, on_event=console.on_event)
     console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
     console.result(result)
 

@@ -131,6 +131,22 @@ def draw_stages(
     axes.plot([], [], color=color, linewidth=1.5, linestyle=linestyle, label=label)
 
 
+def _axes(width: float, height: float) -> tuple[Any, Any]:
+    """Return a figure of a size in inches, and its axes."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasSVG(figure)
+    axes = figure.add_subplot()
+    axes.tick_params(colors=INK, labelsize=8, which="both", length=3)
+    axes.grid(True, color=INK, alpha=0.18, linewidth=0.6)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(INK)
+    return figure, axes
+
+
 def _figure(
     history: History,
     lines: Mapping[str, str],
@@ -139,12 +155,7 @@ def _figure(
     smooth: bool = False,
     marks: tuple[str, Mapping[int, float]] | None = None,
 ) -> str:
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.4, 2.7), layout="constrained")
-    FigureCanvasSVG(figure)
-    axes = figure.add_subplot()
+    figure, axes = _axes(5.4, 2.7)
     for k, (label, name) in enumerate(lines.items()):
         draw_stages(axes, history, name, label=label, smooth=smooth, **line_style(k))
     if marks and marks[1]:
@@ -164,26 +175,10 @@ def _figure(
     return svg_text(figure)
 
 
-def plot_by_image(height: float) -> tuple[Any, Any]:
-    """Return a figure and axes for values of the training photographs, in order."""
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.2, height), layout="constrained")
-    FigureCanvasSVG(figure)
-    axes = figure.add_subplot()
-    axes.set_xlabel("training photograph, by name", fontsize=8, color=INK)
-    axes.tick_params(colors=INK, labelsize=8)
-    axes.grid(True, color=INK, alpha=0.18, linewidth=0.6)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(INK)
-    return figure, axes
-
-
 def lines_by_image(curves: Mapping[str, Sequence[float]]) -> str:
     """Return an SVG of values of the training photographs, one line per entry; several lines get a legend."""
-    figure, axes = plot_by_image(2.4)
+    figure, axes = _axes(8.2, 2.4)
+    axes.set_xlabel("training photograph, by name", fontsize=8, color=INK)
     for k, (label, values) in enumerate(curves.items()):
         style = line_style(k)
         axes.plot(range(1, len(values) + 1), values, ".", ls=style["linestyle"], color=style["color"], label=label)
@@ -227,11 +222,6 @@ def dress_axes(axes: Any, history: History, *, log: bool, legend: bool) -> None:
             axes.text(middle, 1.02, span.name, transform=axes.get_xaxis_transform(), ha="center", fontsize=8, color=INK)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel("iteration", fontsize=8, color=INK)
-    axes.tick_params(colors=INK, labelsize=8, which="both", length=3)
-    axes.grid(True, color=INK, alpha=0.18, linewidth=0.6)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(INK)
     if legend:
         axes.legend(fontsize=8, frameon=False, labelcolor=INK, loc="best", handlelength=1.4)
     if any(side > 9999 for side in axes.get_ylim()) and not log:

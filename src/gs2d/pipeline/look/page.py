@@ -39,14 +39,12 @@ EMBEDDED_TEXTURE = 2048  # px, side of its texture
 OPENING_DISTANCE = 3.2  # radii of the subject; an image of 4 x 3 with a focal length of 4 then shows all of it
 TAIL = 1.0  # per cent of the splats outside the opening box on each side of each axis
 MARGIN = 0.1  # of the longest side of that box, added on each side
-LARGE = 50_000_000  # bytes; slow on phones, too large for e-mail
 
 
 def page_run(
     path: Path,
     out: Path | None = None,
     *,
-    sh_degree: int = 3,
     on_event: OnEvent = ignore,
     loaded: LoadedRun | None = None,
 ) -> dict[str, Any]:
@@ -57,8 +55,6 @@ def page_run(
     path : Path
     out : Path or None
         None: ``scene.html`` in the run, or next to the file.
-    sh_degree : int
-        Degree of the view-dependent colours, 0 to 3.
     on_event : callable
     loaded : LoadedRun or None
         The run, if it is already loaded.
@@ -73,8 +69,6 @@ def page_run(
     out = (path / PAGE if of_run else path.with_suffix(".html")) if out is None else Path(out)
     if out.suffix.lower() not in SUFFIXES:
         raise RunError(f"--out must name an .html file, got {out}")
-    if not 0 <= sh_degree <= 3:
-        raise RunError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
     content = page_content(path, on_event, loaded)
     if content.run is not None:
         content.run.sweep()
@@ -85,12 +79,9 @@ def page_run(
         out,
         content.splats,
         content.scene,
-        sh_degree=sh_degree,
         meshes={} if content.run is None else _embedded_meshes(content.run),
         photographs=photographs,
     )
-    if written["bytes"] > LARGE:
-        on_event(Notice(f"the page is large ({written['bytes'] / 1e6:.0f} MB): --set sh_degree=1 makes it smaller"))
     return {"file": str(out), "views": len(content.scene.views), **written}
 
 
