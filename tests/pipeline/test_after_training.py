@@ -32,7 +32,7 @@ LATER = {  # steps after training, with the result that is missing if they fail
     "train.train_run.keep_facts": "mesh.ply",
     "train.train_run.page_run": "scene.html",
     "train.train_run.write_verdict": "verdict.json",
-    "train.train_run.report_run": "report.html",
+    "finish.run_report.report_run": "report.html",
 }
 ERRORS = (DataError("the points are gone"), ZeroDivisionError("a fault"))
 

@@ -18,7 +18,7 @@ from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.training.events import OnEvent, Phase, Step
+from gs2d.training.events import OnEvent, counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +83,12 @@ def score_views(
 
     Views are rendered with the appearance of their photographs, if known. Masked pixels are ignored.
     """
-    on_event(Phase(name, len(views)))
     scores: dict[str, ImageMetrics] = {}
-    for done, seen in enumerate(_rendered(splats, views, settings, backend, options), start=1):
+    for seen in counted(_rendered(splats, views, settings, backend, options), name, len(views), on_event):
         metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=options.lpips)
         scores[seen.view.name] = metrics
         for visit in options.visitors:
             visit(seen, metrics)
-        on_event(Step(done))
     return scores
 
 

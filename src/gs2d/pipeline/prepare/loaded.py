@@ -34,7 +34,7 @@ from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.events import Notice, OnEvent, Phase, Step
+from gs2d.training.events import Notice, OnEvent, counted
 from gs2d.training.trainer import TrainerOptions, raster_settings
 
 DECODE_THREADS = 2
@@ -198,15 +198,13 @@ def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -
     digest = hashlib.sha256()
     empty: list[View] = []
     train = set(map(id, scene.train))
-    on_event(Phase("reading photographs", len(scene.views)))
-    for done, view in enumerate(scene.preload(DECODE_THREADS), start=1):
+    for view in counted(scene.preload(DECODE_THREADS), "reading photographs", len(scene.views), on_event):
         digest.update(name_bytes(f"{view.name} {'train' if id(view) in train else 'test'}"))
         mask = view.alpha() if scene.masks.masked == EMPTY else view.mask() if uses_masks else None
         empty += [view] if mask is not None and not mask.any() else []
         for array in _arrays(view):
             digest.update(f"{array.shape} {array.dtype}".encode())
             digest.update(np.ascontiguousarray(array).data)
-        on_event(Step(done))
     if empty:
         what = f"the masks of {len(empty)} of {len(scene.views)} views leave no pixel, first {empty[0].name}"
         if set(map(id, empty)) >= train:

@@ -14,7 +14,7 @@ from gs2d.data import Scene, View
 from gs2d.errors import DataError
 from gs2d.losses.known_maps import DepthPlan, Priors, has_priors
 from gs2d.losses.prior_formulas import NormalTarget
-from gs2d.training.events import Notice, OnEvent, Phase, Step
+from gs2d.training.events import Notice, OnEvent, counted
 
 
 def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) -> str:
@@ -29,16 +29,15 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
         return digest
     priors = Priors(scene, recipe, limit_bytes=0)
     extended = hashlib.sha256(digest.encode())
-    on_event(Phase("reading depths and normals", len(scene.train)))
     depths = normals = 0
-    for done, view in enumerate(scene.train, start=1):
-        depth, normal = priors.at(done - 1, torch.float32)
+    views = counted(scene.train, "reading depths and normals", len(scene.train), on_event)
+    for index, view in enumerate(views):
+        depth, normal = priors.at(index, torch.float32)
         depths += depth is not None
         normals += normal is not None
         for array in _arrays(view, priors.plan, normal):
             extended.update(name_bytes(f"{view.name} {array.shape} {array.dtype}"))
             extended.update(np.ascontiguousarray(array).data)
-        on_event(Step(done))
     if priors.plan is not None:
         if not depths:
             raise DataError(f"the depth maps of {scene.name} have no valid value in any training view; are they empty?")

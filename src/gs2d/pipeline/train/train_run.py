@@ -101,14 +101,18 @@ def _train(
     check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     use_threads(options.threads, together.place.local_size)
     use_memory(memory_of(together.place, options.memory))
-    details: list[str] = []
-    on_event = keeping_details(on_event, details)
-    loaded = prepare_run(options, on_event, title=title, part=part)
+    heard: list[Event] = []
+
+    def listen(event: Event) -> None:
+        heard.append(event)
+        on_event(event)
+
+    loaded = prepare_run(options, listen, title=title, part=part)
     if options.overwrite and options.cache is not None:  # before the old run is deleted
         remove_made(make_folder(options.cache))
     run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     with run.locked(), discard_on_failure(run), watched(loaded, on_event) as live:
-        on_event = on_event if live is None else live.on_event
+        tell = on_event if live is None else live.on_event
         if options.cache is not None:  # an unusable folder fails here, not after the first stage
             run.made += make_folder(options.cache)
         if is_run(run.path):
@@ -125,23 +129,26 @@ def _train(
                 )
         else:
             run.write_definition(loaded.resolved.to_json())
-        loaded = lead(loaded, together, on_event)
-        start = choose_start(run, loaded, on_event)
+        loaded = lead(loaded, together, tell)
+        start = choose_start(run, loaded, tell)
         if start.state is None:
-            on_event(Notice(_training_line(loaded)))
+            tell(Notice(_training_line(loaded)))
             if part is None:
-                on_event(Notice(_estimate_line(loaded)))
-            for text in details:
-                run.events.append({"kind": Notice.kind, "text": text})
+                known = None if loaded.init is None else len(loaded.init)
+                needed = estimate(loaded.scene, loaded.recipe, loaded.backend, downscale=loaded.downscale, start=known)
+                tell(Notice(needed.line()))
+            for event in heard:
+                if isinstance(event, Notice) and event.detail:
+                    run.events.append({"kind": Notice.kind, "text": event.text})
         hold()
         if part is not None:
-            train_stages(run, loaded, start, on_event, live=live)
+            train_stages(run, loaded, start, tell, live=live)
             release(loaded.scene)
             return run
         collected = Collector(loaded.scene)
-        splats, now = train_stages(run, loaded, start, on_event, collected, together, live)
+        splats, now = train_stages(run, loaded, start, tell, collected, together, live)
         release(loaded.scene)  # before the volume of the mesh
-        finish(run, replace(loaded, scene=now), splats, on_event, collected)
+        finish(run, replace(loaded, scene=now), splats, tell, collected)
     return run
 
 
@@ -218,17 +225,6 @@ def train_stages(
     return trainer.splats, trainer.scene_now()
 
 
-def keeping_details(on_event: OnEvent, details: list[str]) -> OnEvent:
-    """Return a listener that adds the text of each detail to ``details`` and forwards every event."""
-
-    def listen(event: Event) -> None:
-        if isinstance(event, Notice) and event.detail:
-            details.append(event.text)
-        on_event(event)
-
-    return listen
-
-
 def _training_line(loaded: LoadedRun) -> str:
     """Return photographs, image size and length of a training in one line."""
     scene, resolved = loaded.scene, loaded.resolved
@@ -243,17 +239,6 @@ def _training_line(loaded: LoadedRun) -> str:
         f"{len(scene.train)} of {len(scene.views)} photographs train at {camera.width}x{camera.height}{shrunk} for "
         f"{loaded.recipe.iterations:,} iterations{shortened}; {split}"
     )
-
-
-def _estimate_line(loaded: LoadedRun) -> str:
-    """Return the expected time and memory of a training in one line."""
-    return estimate(
-        loaded.scene,
-        loaded.recipe,
-        loaded.backend,
-        downscale=loaded.downscale,
-        start=None if loaded.init is None else len(loaded.init),
-    ).line()
 
 
 def finish(run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent, collected: Collector) -> None:
