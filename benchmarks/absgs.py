@@ -6,7 +6,7 @@
 
 The paper only says "more sensitive thresholds for size and positional gradient". The sweep therefore divides the
 thresholds of AbsGS-D: both gradient thresholds by one factor, the size threshold (``percent_dense``) by another. Every
-candidate trains stage 3 only; stages 1 and 2 are shared through ``--cache``, also with `gs2d paper`. A is the candidate
+candidate trains stage 3 only; stages 1 and 2 are shared through ``--cache``, also with `gs2d sweep`. A is the candidate
 more sensitive than D with the highest mean PSNR, because the paper tuned for rendering quality. The PSNR is measured on
 the reported test views, so row A is optimistic. An interrupted sweep can be restarted.
 """
@@ -25,7 +25,7 @@ from typing import Any
 
 from gs2d.contrib.lab.aggregate import Cell, read_cell
 from gs2d.contrib.lab.execute import Workers, execute
-from gs2d.contrib.lab.lab_options import PaperOptions
+from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper_recipes import ABSGS_DEFAULT
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
 from gs2d.contrib.lab.table_plan import make_task, trained_recipe
@@ -71,7 +71,7 @@ class Candidate:
 CANDIDATES = tuple(Candidate(g, s) for g, s in itertools.product(FACTORS, FACTORS))
 
 
-def make_jobs(options: PaperOptions, scenes: Sequence[FoundScene]) -> dict[tuple[Candidate, str, int], TrainingTask]:
+def make_jobs(options: SweepOptions, scenes: Sequence[FoundScene]) -> dict[tuple[Candidate, str, int], TrainingTask]:
     """Return one run per candidate, scene and seed."""
     jobs = {}
     for candidate, scene, seed in itertools.product(CANDIDATES, scenes, options.seeds):
@@ -140,7 +140,7 @@ def lost(cell: Cell) -> bool:
     return cell.figures["psnr"] is None and "psnr" in cell.reasons
 
 
-def sweep(options: PaperOptions) -> Candidate | None:
+def sweep(options: SweepOptions) -> Candidate | None:
     """Train all candidates and write ``absgs.json`` and ``absgs.md``."""
     scenes = find_scenes(options.data, options.scenes, truths=options.ground_truth)
     jobs = make_jobs(options, scenes)
@@ -190,7 +190,7 @@ def main() -> None:
     given = vars(parser.parse_args())
     given |= {"scenes": tuple(given["scenes"]), "seeds": tuple(given["seeds"])}
     try:
-        sweep(PaperOptions(table="absgs", **given))
+        sweep(SweepOptions(recipes=("absgs",), **given))
     except Gs2dError as error:
         sys.exit(f"error: {error}")
     print((given["out"] / "absgs.md").read_text(encoding="utf-8"))

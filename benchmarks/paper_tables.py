@@ -1,11 +1,11 @@
-"""Make the tables of docs/notebook/paper-tables.md: run `gs2d paper` for every paper table and capture group.
+"""Make the tables of docs/notebook/paper-tables.md: run `gs2d sweep` for every paper table and capture group.
 
 ::
 
     python -m benchmarks.paper_tables --data CAPTURES --out runs/paper [--tables modules k] [--groups bottle-lego]
         [--slots 2] [--seeds 3]
 
-``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d paper` writes full pages with the paper's figures,
+``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d sweep` writes full pages with the paper's figures,
 the deviations and every command. This script prints a summary in the page's format: a table per capture, and which of
 the paper's rankings are reproduced. Finished runs are kept, so an interrupted command can be restarted.
 """
@@ -37,7 +37,7 @@ GROUPS = (
     Group("scan24", ("dtu_scan24",), downscale=8),
     Group("fox", ("fox_instant_ngp",), downscale=4),
 )
-CALLED = {  # name in `gs2d paper` -> name here
+CALLED = {  # name in `gs2d sweep` -> name here
     "other (nerf-synthetic)": "Bottle",
     "NeRF-Synthetic": "Lego",
     "DTU": "DTU scan 24 (training views)",
@@ -46,9 +46,9 @@ CALLED = {  # name in `gs2d paper` -> name here
 
 
 def make_table(table: str, group: Group, args: argparse.Namespace) -> str:
-    """Run `gs2d paper` and return its Markdown."""
+    """Run `gs2d sweep` and return its Markdown."""
     out = args.out / f"{group.name}-{table}"
-    words = ["gs2d", "paper", table, "--data", str(args.data), "--scenes", *group.scenes, "--out", str(out)]
+    words = ["gs2d", "sweep", table, "--data", str(args.data), "--scenes", *group.scenes, "--out", str(out)]
     words += ["--cache", str(args.out / "cache"), "--schedule-scale", SCALE, "--downscale", str(group.downscale)]
     words += ["--seeds", str(args.seeds), *(["--slots", str(args.slots)] if args.slots else [])]
     execute(words)

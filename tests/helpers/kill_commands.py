@@ -240,7 +240,7 @@ class Report(OfRun):
 class Sweep(Command):
     """``gs2d sweep`` of two recipes; the second continues from a stage of the first.
 
-    ``gs2d paper`` calls the same function with other recipes.
+    A table of the paper has other recipes.
     """
 
     name = "sweep"

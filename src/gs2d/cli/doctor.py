@@ -18,7 +18,7 @@ _EXTRAS = {  # extra -> (the commands that need it, its packages)
     "texture": ("textured meshes (--texture)", ("xatlas",)),
     "spz4": ("SPZ of version 4 (gs2d export --format spz4)", ("zstandard",)),
     "usd": ("OpenUSD files (gs2d export --out x.usd)", ("usd-core",)),
-    "cluster": ("several machines (gs2d sweep, paper, blocks --cluster)", ("ray",)),
+    "cluster": ("several machines (gs2d sweep, blocks --cluster)", ("ray",)),
 }
 _HEIC = "pip install pi-heif (its wheel holds LGPL code), or convert to JPEG"
 

@@ -15,7 +15,7 @@ from gs2d.cli.parser import parse
 from gs2d.config.protocols import MetricConventions
 from gs2d.contrib.lab.aggregate import Cell, Results, check_claim, read_cell
 from gs2d.contrib.lab.deviations import deviations_of
-from gs2d.contrib.lab.lab_options import PaperOptions
+from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper_tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Claim
 from gs2d.contrib.lab.table_plan import commands_of, make_plan
 from gs2d.pipeline.prepare.options import TrainOptions, values
@@ -86,7 +86,7 @@ def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
     check = {"ok": False, "messages": ["only 40% of the cameras agree"]}
     details = {"backend": "cpu", "surface": {"evaluator": "visible-surface", "self_check": check}}
     cell = replace(make_cell("Barn", psnr=1.0, bytes=1.0, fscore=0.1), details=details)
-    options = PaperOptions(table="absgs", data=Path("data"), out=Path("out"), slots=2)
+    options = SweepOptions(recipes=("absgs",), data=Path("data"), out=Path("out"), slots=2)
     table = PAPER_TABLES["absgs"]
     lines = deviations_of(options, (), table, Results((make_row("row", cell),)))
     assert "Barn: do not believe the surface scores of row (seed 0): only 40% of the cameras agree" in lines
@@ -106,8 +106,8 @@ def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
 
 def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None:
     write_capture(tmp_path / "a b" / "bäll", train=2, test=1, size=8)
-    options = PaperOptions(
-        table="absgs",
+    options = SweepOptions(
+        recipes=("absgs",),
         data=tmp_path / "a b",
         out=tmp_path / "o ut",
         schedule_scale=0.05,

@@ -1,4 +1,4 @@
-"""`gs2d paper`: scenes found, rows averaged, claims judged, tables written, failures named, nothing done twice."""
+"""`gs2d sweep` of a table of the paper: scenes found, rows averaged, claims judged, tables written, failures named, nothing done twice."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from gs2d.cli import run
 from gs2d.contrib.lab import training_task as task_module
 from gs2d.contrib.lab.aggregate import FIGURES, Results, Row, check_claim
-from gs2d.contrib.lab.lab_options import PaperOptions
+from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper import paper
 from gs2d.contrib.lab.paper_tables import PAPER_TABLES, TNT, Claim, recipe_table
 from gs2d.contrib.lab.render import parts_of, to_markdown
@@ -49,7 +49,9 @@ def test_scenes_are_found_with_their_data_set_and_ground_truth(captures: Path) -
 
 # -- plans ---------------------------------------------------------------------------------------------------------
 def test_rows_share_stages_that_train_the_same(captures: Path) -> None:
-    plan = make_plan(PaperOptions(table="modules", data=captures, out=captures / "out", scenes=("ball",), seeds=(0, 1)))
+    plan = make_plan(
+        SweepOptions(recipes=("modules",), data=captures, out=captures / "out", scenes=("ball",), seeds=(0, 1))
+    )
     by_name = {job.name: job for job in plan.tasks}
     assert list(by_name)[:4] == [
         "ball-2dgs-s0",
@@ -120,7 +122,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, l
     for name in ("ball", "broken"):
         write_capture(folder / "data" / name, train=3, test=1, size=20)
     (folder / "data" / "broken" / "train" / "r_1.png").write_bytes(b"no picture")
-    words = ["paper", "modules", "--data", str(folder / "data"), "--out", str(folder / "out"), "--threads", "1", *TINY]
+    words = ["sweep", "modules", "--data", str(folder / "data"), "--out", str(folder / "out"), "--threads", "1", *TINY]
     with pytest.MonkeyPatch.context() as patch:
         draw_nothing(patch)
         assert run([*words, "--quiet"]) == 2
@@ -183,7 +185,7 @@ def test_what_is_done_is_not_done_again(
 @pytest.mark.slow
 def test_a_command_killed_at_any_moment_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     write_capture(tmp_path / "data" / "ball", train=3, test=1, size=20)
-    words = ["paper", "modules", "--data", str(tmp_path / "data"), "--threads", "1", *TINY, "--quiet", "--out"]
+    words = ["sweep", "modules", "--data", str(tmp_path / "data"), "--threads", "1", *TINY, "--quiet", "--out"]
     killed, undisturbed = tmp_path / "killed", tmp_path / "undisturbed"
     records = killed / "jobs"
     with subprocess.Popen([sys.executable, "-m", "gs2d", *words, str(killed)]) as process:
@@ -203,6 +205,6 @@ def test_a_command_killed_at_any_moment_goes_on_to_the_same_bytes(tmp_path: Path
 
 def test_a_folder_made_with_other_options_is_refused(finished: tuple[Path, list[str]]) -> None:
     out, words = finished
-    options = PaperOptions(table="modules", data=Path(words[3]), out=out, schedule_scale=0.1)
+    options = SweepOptions(recipes=("modules",), data=Path(words[3]), out=out, schedule_scale=0.1)
     with pytest.raises(RunError, match="made with schedule_scale = 0.0005, now 0.1"):
         paper(options)

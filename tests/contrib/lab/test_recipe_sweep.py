@@ -76,7 +76,7 @@ def test_a_folder_holds_a_sweep_or_a_table_of_the_paper(
 ) -> None:
     write_capture(tmp_path / "ball", train=2, test=1, size=8)
     words = ["--data", str(tmp_path), "--out", str(tmp_path / "out"), "--no-train", "--quiet"]
-    commands = {"paper": ["paper", "modules", *words], "sweep": ["sweep", "2dgs", *words]}
+    commands = {"paper": ["sweep", "modules", *words], "sweep": ["sweep", "2dgs", *words]}
     assert run(commands.pop(first)) == 0
     assert run(commands.popitem()[1]) == 2
     (line,) = capsys.readouterr().err.splitlines()

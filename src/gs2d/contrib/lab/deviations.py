@@ -8,7 +8,7 @@ from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import GradDensify
 from gs2d.config.schedule import scale_schedule
 from gs2d.contrib.lab.aggregate import NOT_YET, Results, surface_metric
-from gs2d.contrib.lab.lab_options import TableOptions
+from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
 from gs2d.contrib.lab.scenes import FoundScene, missing_scenes, unreadable
 from gs2d.data.image_files import image_size
@@ -21,7 +21,7 @@ OFFICIAL_EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by da
 
 
 def deviations_of(
-    options: TableOptions, scenes: Sequence[FoundScene], table: PaperTable, results: Results
+    options: SweepOptions, scenes: Sequence[FoundScene], table: PaperTable, results: Results
 ) -> list[str]:
     """Return the known differences, the most important first."""
     found = []
@@ -140,7 +140,7 @@ def _surfaces(results: Results) -> Iterator[str]:
         yield f"{scene}: do not believe the surface scores of {', '.join(runs)}: {why}"
 
 
-def _scenes(options: TableOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
+def _scenes(options: SweepOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
     """Return differences in images and scenes, and missing files."""
     if table.of_paper:
         yield from _other_scenes(scenes, table)

@@ -26,7 +26,7 @@ POLL_SECONDS = 0.5
 
 @dataclass(frozen=True)
 class Workers:
-    """Where and with which resources tasks run; the fields are options of `gs2d sweep`, `paper` and `blocks`.
+    """Where and with which resources tasks run; the fields are options of `gs2d sweep` and `blocks`.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The commands blocks, paper and sweep. Imports no torch, so that `--help` is instant."""
+"""The commands blocks and sweep. Imports no torch, so that `--help` is instant."""
 
 from __future__ import annotations
 
@@ -8,17 +8,9 @@ from dataclasses import dataclass
 
 from gs2d.cli.command_registry import MEASURE, STEPS, register_command
 from gs2d.cli.commands import Common
-from gs2d.contrib.lab.lab_options import BlocksOptions, PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.lab_options import BlocksOptions, SweepOptions
 
 _ACTIONS = "gs2d.contrib.lab.show_table"
-
-
-class Continued(TableOptions, Common):
-    """A command that another call continues."""
-
-    def after_interrupt(self, words: Sequence[str]) -> str:
-        """Return the command that continues."""
-        return f"; continue with: gs2d {shlex.join(words)}" if self.train else ""
 
 
 @register_command(
@@ -36,19 +28,12 @@ class BlocksCommand(BlocksOptions, Common):
     "sweep",
     action=f"{_ACTIONS}:show_table",
     group=MEASURE,
-    first=("recipes", "data", "out", "seeds", "schedule_scale", "train"),
+    first=("recipes", "data", "out", "scenes", "seeds", "schedule_scale", "train"),
 )
 @dataclass(frozen=True, kw_only=True)
-class SweepCommand(SweepOptions, Continued):
-    """Compare recipes on scenes and seeds, as a table."""
+class SweepCommand(SweepOptions, Common):
+    """Compare recipes on scenes and seeds, as a table; or reproduce a table of the paper."""
 
-
-@register_command(
-    "paper",
-    action=f"{_ACTIONS}:show_table",
-    group=MEASURE,
-    first=("table", "data", "out", "scenes", "schedule_scale", "train"),
-)
-@dataclass(frozen=True, kw_only=True)
-class PaperCommand(PaperOptions, Continued):
-    """Reproduce a table of the paper."""
+    def after_interrupt(self, words: Sequence[str]) -> str:
+        """Return the command that continues."""
+        return f"; continue with: gs2d {shlex.join(words)}" if self.train else ""

@@ -1,11 +1,11 @@
-"""Options of `gs2d paper`, `gs2d sweep` and `gs2d blocks`."""
+"""Options of `gs2d sweep` and `gs2d blocks`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from gs2d.config.arguments import Arg
 from gs2d.errors import RecipeError
@@ -13,12 +13,16 @@ from gs2d.pipeline.prepare.options import CommonTraining, Options, Overrides, Re
 
 _PARTITION = "partition."  # prefix of changes of the partition in --set
 SWEEP = "sweep"  # the name of a table of chosen recipes
+TABLES = ("regularisation", "benchmark", "k", "freeze", "modules", "absgs")  # of the paper
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableOptions(Options):
-    """Options of the commands that train and score many runs."""
+class SweepOptions(Options):
+    """Options of `gs2d sweep`."""
 
+    recipes: Annotated[tuple[str, ...], Arg(metavar="RECIPE [RECIPE ...]", positional=True)]
+    """Recipes: names that `gs2d recipes` lists, or files (mine.json, mine.py:name). Or a table of the paper:
+    regularisation, benchmark, k, freeze, modules or absgs."""
     data: Annotated[Path, Arg(metavar="DIR")]
     """Capture, or folder of captures."""
     out: Annotated[Path, Arg(metavar="DIR")]
@@ -54,36 +58,14 @@ class TableOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "recipes", _split(self.recipes))
         object.__setattr__(self, "scenes", _split(self.scenes))
         object.__setattr__(self, "seeds", parse_seeds(self.seeds))
 
-
-@dataclass(frozen=True, kw_only=True)
-class PaperOptions(TableOptions):
-    """Options of `gs2d paper`."""
-
-    table: Annotated[
-        Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"],
-        Arg(metavar="TABLE", positional=True),
-    ]
-    """Table of the paper."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SweepOptions(TableOptions):
-    """Options of `gs2d sweep`."""
-
-    recipes: Annotated[tuple[str, ...], Arg(metavar="RECIPE [RECIPE ...]", positional=True)]
-    """Recipes: names that `gs2d recipes` lists, or files (mine.json, mine.py:name)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "recipes", _split(self.recipes))
-
     @property
     def table(self) -> str:
-        """Return the name of the table."""
-        return SWEEP
+        """Return the name of the table: that of the paper, or ``SWEEP``."""
+        return self.recipes[0] if len(self.recipes) == 1 and self.recipes[0] in TABLES else SWEEP
 
 
 def _split(words: Iterable[str]) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 from gs2d.contrib.lab.aggregate import FIGURES, ClaimResult, Results, Row, check_claims, read_cell
 from gs2d.contrib.lab.deviations import deviations_of
 from gs2d.contrib.lab.execute import Workers, execute
-from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.lab_options import SWEEP, SweepOptions
 from gs2d.contrib.lab.paper_tables import DTU, TNT, PaperRow, PaperTable
 from gs2d.contrib.lab.render import to_markdown, write_page
 from gs2d.contrib.lab.scenes import FoundScene
@@ -32,7 +32,7 @@ FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrid
 
 @dataclass(frozen=True)
 class PaperResult:
-    """The result of ``gs2d paper`` or ``gs2d sweep``.
+    """The result of ``gs2d sweep``.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class PaperResult:
     unfinished: int
 
 
-def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> PaperResult:
+def paper(options: SweepOptions, on_event: OnEvent = ignore) -> PaperResult:
     """Train the missing runs of a table, and write the table.
 
     Cells of a failed run are empty, with the reason; other runs continue.
@@ -87,7 +87,7 @@ def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> P
 def with_other_rows(plan: Plan) -> Plan:
     """Return the plan of a sweep with the rows of earlier commands, which stay in the table."""
     options, path = plan.options, plan.options.out / ABOUT
-    if not isinstance(options, SweepOptions) or not path.exists():
+    if options.table != SWEEP or not path.exists():
         return plan
     found = _about(path).get("recipes")
     if not isinstance(found, list):
@@ -105,7 +105,7 @@ def check_folder(plan: Plan) -> None:
         return
     before, after = _about(path).get("options"), json.loads(json.dumps(_defining(plan.options)))
     if not isinstance(before, dict):
-        raise RunError(f"{path} must be one that gs2d paper or sweep wrote, got another file; choose another --out")
+        raise RunError(f"{path} must be one that gs2d sweep wrote, got another file; choose another --out")
     for name, value in after.items():
         if before.get(name) != value:
             raise RunError(
@@ -119,10 +119,10 @@ def _about(path: Path) -> dict[str, Any]:
     found = read_json(path)
     if isinstance(found, dict):
         return found
-    raise RunError(f"{path} must be one that gs2d paper or sweep wrote, got another file; choose another --out")
+    raise RunError(f"{path} must be one that gs2d sweep wrote, got another file; choose another --out")
 
 
-def _defining(options: TableOptions) -> dict[str, Any]:
+def _defining(options: SweepOptions) -> dict[str, Any]:
     return {name: getattr(options, name) for name in FIXED}
 
 

@@ -83,7 +83,7 @@ class PaperTable:
     @property
     def command(self) -> str:
         """What makes it."""
-        return f"gs2d paper {self.name}" if self.of_paper else "gs2d sweep"
+        return f"gs2d sweep {self.name}" if self.of_paper else "gs2d sweep"
 
 
 def recipe_table(recipes: Sequence[str]) -> PaperTable:

@@ -1,4 +1,4 @@
-"""Actions of the commands blocks, paper and sweep."""
+"""Actions of the commands blocks and sweep."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 from gs2d.cli.console import Console
 from gs2d.cli.results import show_run
 from gs2d.contrib.lab.blocks import blocks
-from gs2d.contrib.lab.lab_commands import BlocksCommand, PaperCommand, SweepCommand
+from gs2d.contrib.lab.lab_commands import BlocksCommand, SweepCommand
 from gs2d.contrib.lab.paper import PaperResult
 from gs2d.contrib.lab.paper import paper as run_paper
 from gs2d.contrib.lab.render import TITLES, claim_text, parts_of
@@ -20,8 +20,8 @@ def show_blocks(command: BlocksCommand, console: Console) -> None:
     show_run(run.path, run.metrics(), console)
 
 
-def show_table(command: PaperCommand | SweepCommand, console: Console) -> None:
-    """Run ``gs2d paper`` or ``gs2d sweep``.
+def show_table(command: SweepCommand, console: Console) -> None:
+    """Run ``gs2d sweep``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Plans a table of ``gs2d paper`` or ``gs2d sweep``: the tasks of all recipes, scenes and seeds."""
+"""Plans a table of ``gs2d sweep``: the tasks of all recipes, scenes and seeds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gs2d.config.recipe import Recipe, validate
 from gs2d.config.recipe_files import short_name
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
-from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.lab_options import SWEEP, SweepOptions
 from gs2d.contrib.lab.paper_tables import PAPER_TABLES, PaperTable, recipe_table
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
 from gs2d.contrib.lab.training_task import TrainingTask, stage_keys
@@ -26,7 +26,7 @@ from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
 class Plan:
     """The scenes of a table, and its tasks by (recipe, scene, seed)."""
 
-    options: PaperOptions | SweepOptions
+    options: SweepOptions
     table: PaperTable
     scenes: tuple[FoundScene, ...]
     cells: Mapping[tuple[str, str, int], TrainingTask]
@@ -37,7 +37,7 @@ class Plan:
         return tuple({task.name: task for task in self.cells.values()}.values())
 
 
-def make_plan(options: PaperOptions | SweepOptions) -> Plan:
+def make_plan(options: SweepOptions) -> Plan:
     """Return the plan of a table, and check all options, before any image is read."""
     table = _table(options)
     if not options.seeds or len(set(options.seeds)) != len(options.seeds):
@@ -58,20 +58,18 @@ def make_plan(options: PaperOptions | SweepOptions) -> Plan:
     return Plan(options, table, scenes, cells)
 
 
-def _table(options: PaperOptions | SweepOptions) -> PaperTable:
+def _table(options: SweepOptions) -> PaperTable:
     """Return the table of the requested rows."""
-    if isinstance(options, SweepOptions):
-        if not options.recipes:
-            raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
-        for name in options.recipes:
-            get_recipe(name)  # unknown names raise first
-        return recipe_table(options.recipes)
-    if options.table not in PAPER_TABLES:
-        raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
-    return PAPER_TABLES[options.table]
+    if options.table != SWEEP:
+        return PAPER_TABLES[options.table]
+    if not options.recipes:
+        raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
+    for name in options.recipes:
+        get_recipe(name)  # unknown names raise first
+    return recipe_table(options.recipes)
 
 
-def trained_recipe(name: str, options: TableOptions) -> Recipe:
+def trained_recipe(name: str, options: SweepOptions) -> Recipe:
     """Return a recipe with the schedule and overrides of the options."""
     recipe = scale_schedule(get_recipe(name), options.schedule_scale)
     return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
@@ -91,7 +89,7 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
             raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
 
 
-def make_task(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> TrainingTask:
+def make_task(options: SweepOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> TrainingTask:
     """Return the task that trains a recipe (``trained_recipe`` of ``name``) on a scene."""
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
@@ -99,7 +97,7 @@ def make_task(options: TableOptions, scene: FoundScene, name: str, recipe: Recip
         out=options.out / "runs" / f"{scene.name}-{short_name(name)}-s{seed}",
         recipe=name,
         protocol=scene.protocol.name if options.protocol == "auto" else options.protocol,
-        robust="auto" if isinstance(options, SweepOptions) else "off",  # as in the paper
+        robust="auto" if options.table == SWEEP else "off",  # as in the paper
         backend=options.backend,
         format=scene.format,
         downscale=downscale,
@@ -125,7 +123,7 @@ def make_task(options: TableOptions, scene: FoundScene, name: str, recipe: Recip
     )
 
 
-def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
+def _wanted(scene: FoundScene, options: SweepOptions) -> Iterator[str]:
     """Yield the inputs of scores; a run that lacks one is scored again."""
     if scene.scored:
         yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
@@ -134,11 +132,10 @@ def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
 
 
 # -- the commands that do it -------------------------------------------------------------------------------------------
-def paper_command(options: PaperOptions | SweepOptions) -> str:
+def paper_command(options: SweepOptions) -> str:
     """Return the command line of a table."""
-    words = ["sweep", *options.recipes] if isinstance(options, SweepOptions) else ["paper", options.table]
-    said = ("table", "recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json")
-    return _command(words, options, said)
+    said = ("recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json")
+    return _command(["sweep", *options.recipes], options, said)
 
 
 def commands_of(task: TrainingTask) -> list[str]:
