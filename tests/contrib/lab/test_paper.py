@@ -1,4 +1,4 @@
-"""`gs2d sweep` of a table of the paper: scenes found, rows averaged, claims judged, tables written, failures named, nothing done twice."""
+"""Tables of the paper: scenes found, rows averaged, claims judged, tables written, failures named."""
 
 from __future__ import annotations
 
