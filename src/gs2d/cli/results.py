@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.cli.console import Console, figure
+from gs2d.errors import DataError, RunError
 
 WIDTH = 60  # columns of the verdict: half of a small screen
 _NAMES, _GRADES = 14, 8  # columns of the names and grades of findings
@@ -23,8 +24,7 @@ def show_run(
     extra: dict[str, Any] | None = None,
 ) -> None:
     """Show the metrics of a run as a table, its files, and its verdict; all of it with ``extra`` as JSON."""
-    from gs2d.io.run_dir import RunFolder
-    from gs2d.pipeline.finish.run_verdict import read_verdict
+    from gs2d.report.sections.verdict_section import read_verdict
 
     result = {"run": str(path), **metrics, **(extra or {})}
     if definition is not None:
@@ -37,7 +37,11 @@ def show_run(
     for name in _FILES:
         if (path / name).exists():
             console.say(f"{path / name}")
-    result["verdict"] = verdict = read_verdict(RunFolder(path))
+    try:
+        verdict = read_verdict(path)
+    except (DataError, RunError):  # the report names the error
+        verdict = None
+    result["verdict"] = verdict
     for line in verdict_lines(verdict) if verdict is not None else ():
         console.say(line)
     console.result(result)

@@ -43,7 +43,6 @@ METRICS_SHAPE: Shape = {
         }
     ],
     "surface?": ({"chamfer?": _NUMBER, "unit?": str, "thresholds?": ([_THRESHOLD], None)}, None),
-    "surface_reason?": (str, None),
     "mesh?": (dict, None),
 }
 VERDICT_SHAPE: Shape = {

@@ -67,27 +67,12 @@ def read_gallery(renders: Path) -> Gallery | None:
     DataError
         If the index is broken.
     """
-    data = read_index(renders)
-    return None if data is None else Gallery(renders, tuple(map(_shown_view, data["views"])), tuple(data["stages"]))
-
-
-def read_index(renders: Path) -> dict[str, Any] | None:
-    """Return ``index.json`` with its lists ``views`` and ``stages``, or None where there is none.
-
-    Raises
-    ------
-    DataError
-        If it is broken.
-    """
     path = renders / "index.json"
     if not path.is_file():
         return None
     with reading(path):
         data = read_json(path)
-        index = {**data, "views": list(data.get("views", ())), "stages": [str(name) for name in data.get("stages", ())]}
-        for view in index["views"]:
-            _shown_view(view)
-    return index
+        return Gallery(renders, tuple(map(_shown_view, data["views"])), tuple(map(str, data["stages"])))
 
 
 def _shown_view(entry: dict[str, Any]) -> ShownView:

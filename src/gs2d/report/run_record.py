@@ -27,8 +27,7 @@ class RunRecord:
     stages : tuple of dict
         Entries of ``metrics.json``, one per finished stage.
     surface : dict or None
-        Surface metrics; ``surface_reason`` says why there are none.
-    surface_reason : str or None
+        Surface metrics.
     events : list of dict
         ``events.jsonl``.
     """
@@ -37,7 +36,6 @@ class RunRecord:
     definition: dict[str, Any]
     stages: tuple[dict[str, Any], ...] = ()
     surface: dict[str, Any] | None = None
-    surface_reason: str | None = None
     events: Sequence[dict[str, Any]] = ()
 
     @property
@@ -52,9 +50,9 @@ class RunRecord:
 
     @property
     def recipe(self) -> Mapping[str, Any]:
-        """Return the recipe of ``run.json``; empty where it has none."""
-        recipe = self.definition.get("recipe")
-        return recipe if isinstance(recipe, Mapping) else {}
+        """Return the recipe of ``run.json``."""
+        recipe: Mapping[str, Any] = self.definition["recipe"]
+        return recipe
 
     @property
     def unfinished(self) -> list[str]:
@@ -65,8 +63,7 @@ class RunRecord:
     @property
     def title(self) -> str:
         """Return the heading of the report."""
-        scene = self.definition.get("scene")
-        return str(self.definition.get("title") or name_of(scene or self.path.name))
+        return str(self.definition.get("title") or self.definition["scene"]["name"])
 
 
 def read_record(folder: Path) -> RunRecord:
@@ -86,7 +83,6 @@ def read_record(folder: Path) -> RunRecord:
         definition=run.definition(),
         stages=tuple(metrics.get("stages") or ()),
         surface=metrics.get("surface"),
-        surface_reason=metrics.get("surface_reason"),
         events=run.events.read(),
     )
 

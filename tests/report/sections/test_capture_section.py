@@ -38,7 +38,7 @@ def capture(folder: Path, found: dict[str, Any]) -> Path:
 
 def test_the_report_has_unplaced_photographs_cameras_and_image(tmp_path: Path) -> None:
     capture(tmp_path / "capture", FOUND)
-    html = str(capture_section(RunRecord(tmp_path, {})))
+    html = str(capture_section(RunRecord(tmp_path, {"scene": {"path": str(tmp_path)}})))
     assert "2 of 3 photographs have a camera. There are 1,234 sparse points" in html
     assert "&lt;c&gt;.jpg" in html
     assert "21 matches with a.jpg at best" in html
@@ -56,13 +56,12 @@ def test_a_capture_outside_the_run_is_read_by_its_path(tmp_path: Path) -> None:
 
 def test_cameras_from_elsewhere_have_no_section(tmp_path: Path) -> None:
     assert capture_section(RunRecord(tmp_path, {"scene": {"path": str(tmp_path)}})) is None
-    assert capture_section(RunRecord(tmp_path, {})) is None
 
 
 def test_a_missing_image_is_reported_and_a_broken_file_is_an_error(tmp_path: Path) -> None:
     folder = capture(tmp_path / "capture", FOUND)
     (folder / "poses.png").unlink()
-    assert "poses.png cannot be shown" in str(capture_section(RunRecord(tmp_path, {})))
+    assert "poses.png cannot be shown" in str(capture_section(RunRecord(tmp_path, {"scene": {"path": str(tmp_path)}})))
     (folder / "poses.json").write_text("{}")
     with pytest.raises(DataError, match=r"poses\.json is damaged"):
-        capture_section(RunRecord(tmp_path, {}))
+        capture_section(RunRecord(tmp_path, {"scene": {"path": str(tmp_path)}}))

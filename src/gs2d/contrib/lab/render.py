@@ -17,7 +17,7 @@ from gs2d.contrib.lab.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, 
 from gs2d.core.atomic_files import atomic_write
 from gs2d.data.image_files import read_image
 from gs2d.io.run_dir import RENDERS
-from gs2d.report.gallery import read_index
+from gs2d.report.gallery import read_gallery
 from gs2d.report.html_parts import image_tag, page
 
 DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 2, "seconds": 0}
@@ -244,16 +244,17 @@ def side_by_side(results: Results) -> list[dict[str, Any]]:
     """Return one view of each scene in every trained row: its name and its images by kind."""
     found: list[dict[str, Any]] = []
     for scene, runs in _runs_by_scene(results).items():
-        index = read_index(next(iter(runs.values())) / RENDERS) if runs else {"views": [None]}
-        for view in (index or {"views": []})["views"][:1]:
+        if not runs:
+            found.append({"name": scene, "view": None, "runs": []})
+            continue
+        gallery = read_gallery(next(iter(runs.values())) / RENDERS)
+        for view in gallery.views[:1] if gallery is not None else ():
             found.append({"name": scene, "view": view, "runs": list(runs)})
-            if view is None:
-                continue
-            photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view.get('file', '')}.png"
+            photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view.file}.png"
             found[-1]["images"] = images = {}
             for what, title in IMAGES.items():
                 first = _image(photo, f"{scene}: photograph") if what == "color" else Markup("<div></div>")
-                others = [(name, _last_image(run, view.get("file", ""), what)) for name, run in runs.items()]
+                others = [(name, _last_image(run, view.file, what)) for name, run in runs.items()]
                 images[title] = [first, *(_image(p, f"{scene}, {name}: {title.lower()}") for name, p in others)]
     return found
 
@@ -271,8 +272,9 @@ def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
 
 def _last_image(run: Path, file: str, what: str) -> Path:
     """Return an image after the last rendered stage."""
-    stages = (read_index(run / RENDERS) or {"stages": []})["stages"]
-    return run / RENDERS / (stages[-1] if stages else "none") / f"{file}.{what}.png"
+    gallery = read_gallery(run / RENDERS)
+    stage = gallery.stages[-1] if gallery is not None and gallery.stages else "none"
+    return run / RENDERS / stage / f"{file}.{what}.png"
 
 
 def _image(path: Path, alt: str) -> Markup:

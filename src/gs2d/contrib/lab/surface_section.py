@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.data.image_files import read_image
-from gs2d.report.html_parts import missing, render
+from gs2d.report.html_parts import render
 from gs2d.report.run_record import RunRecord
 from gs2d.report.sections.section_registry import register_section
 
@@ -49,7 +49,7 @@ def surface_section(run: RunRecord) -> str | None:
     """Return scores and distances, or the reason why there are none; None for runs without a true surface."""
     surface = run.surface
     if not surface:
-        return missing(f"The surface was not scored: {run.surface_reason}.") if run.surface_reason else None
+        return None
     scores = [
         [f"{row['threshold']:.4g}", *(_score(row.get(name)) for name in list(_COLUMNS)[1:])]
         for row in surface.get("thresholds") or []

@@ -65,6 +65,6 @@ def evaluate_run(
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
         with attempted_file(run, VERDICT, on_event):
-            result["verdict"] = write_verdict(run, loaded, collected)["verdict"]
+            result["verdict"] = write_verdict(run, loaded, collected)
     report_again(run, on_event)
     return result

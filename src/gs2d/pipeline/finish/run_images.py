@@ -43,7 +43,7 @@ from gs2d.report.color_maps import (
     normal_image,
     valid_image,
 )
-from gs2d.report.gallery import read_index
+from gs2d.report.gallery import Gallery, read_gallery
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
 INDEX = "index.json"
@@ -101,8 +101,8 @@ def draw_stage(
     folder = run.file(RENDERS)
     for name in ("photos", stage):
         make_folder(folder / name)
-    index = read_index(folder) or {"views": [], "stages": []}
-    limits = {entry["name"]: entry.get("depth_limits") for entry in index["views"]}
+    drawn = read_gallery(folder) or Gallery(folder, (), ())
+    limits = {view.name: view.depth_limits for view in drawn.views}
     views, background = [], loaded.settings.background
     files = file_names([view for _, view in shown])
     for (split, view), file in zip(shown, files, strict=True):
@@ -127,7 +127,7 @@ def draw_stage(
         write_image(folder / "photos" / f"{file}.png", valid_image(photo, view.valid()))
         shown_as = {"name": view.name, "file": file, "split": split, "depth_limits": near_far}
         views.append({**shown_as, "camera": camera_json(view.camera)})
-    stages = [*(name for name in index["stages"] if name != stage), stage]
+    stages = [*(name for name in drawn.stages if name != stage), stage]
     write_json(folder / INDEX, {"views": views, "stages": stages, "images": list(IMAGES)})
 
 

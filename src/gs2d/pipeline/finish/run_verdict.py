@@ -14,17 +14,17 @@ from typing import Any
 
 from gs2d.config import grades
 from gs2d.config.grades import GOOD, POOR, USABLE
-from gs2d.core.json_files import read_json, write_json
+from gs2d.core.json_files import write_json
 from gs2d.data import Scene
-from gs2d.errors import DataError, RunError
+from gs2d.errors import RunError
 from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import VERDICT, RunFolder
-from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
 from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.open_capture import placed_photographs
 from gs2d.render.types import RenderOutput
+from gs2d.report.sections.verdict_section import read_verdict
 
 FORMAT = 3
 NAMED = 3  # views named in a sentence; verdict.json has all
@@ -268,8 +268,8 @@ def _some(names: Sequence[str]) -> str:
 
 
 # -- verdict.json ------------------------------------------------------------------------------------------------------
-def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> dict[str, Any]:
-    """Judge a run and write ``verdict.json``; without newly measured views, return the earlier verdict.
+def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> dict[str, Any] | None:
+    """Judge a run, write ``verdict.json``, and return the verdict; without newly measured views the earlier one.
 
     Raises
     ------
@@ -282,23 +282,8 @@ def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> di
     if not collected.views:
         if not run.file(VERDICT).exists():
             raise RunError("the run was interrupted between scoring and measuring; `gs2d evaluate RUN` measures it")
-        return _read(run)
+        return read_verdict(run.path)
     measures = Measures(collected.views, *placed_photographs(loaded.scene.root))
-    data = {"format": FORMAT, "verdict": asdict(judge(measures)), "measured": asdict(measures)}
-    write_json(run.file(VERDICT), data)
-    return data
-
-
-def read_verdict(run: RunFolder) -> dict[str, Any] | None:
-    """Return the verdict of a run, or None if there is none, or it cannot be read."""
-    try:
-        return dict(_read(run)["verdict"]) if run.file(VERDICT).exists() else None
-    except (DataError, RunError):
-        return None
-
-
-def _read(run: RunFolder) -> dict[str, Any]:
-    path = run.file(VERDICT)
-    data: dict[str, Any] = read_json(path)
-    check_shape(path, data, VERDICT_SHAPE, "delete it; `gs2d evaluate RUN` writes it again")
-    return data
+    verdict = asdict(judge(measures))
+    write_json(run.file(VERDICT), {"format": FORMAT, "verdict": verdict, "measured": asdict(measures)})
+    return verdict

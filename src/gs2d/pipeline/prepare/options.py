@@ -35,23 +35,6 @@ def values(kind: type[Any], options: Any) -> dict[str, Any]:
     return {entry.name: getattr(options, entry.name) for entry in fields(kind)}
 
 
-def learned_names(learn: str | tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names in a value of ``--learn``; "none" is ().
-
-    Raises
-    ------
-    RecipeError
-        If no quantity has one of the names.
-    """
-    names = tuple(learn.split(",")) if isinstance(learn, str) else learn
-    if names == ("none",):
-        return ()
-    for name in names:
-        if name not in ("auto", *QUANTITIES.builtin):
-            raise RecipeError(f"--learn: {QUANTITIES.unknown(name, also=('auto', 'none'))}")
-    return names
-
-
 def check_choices(options: object) -> None:
     """Raise RecipeError for a value that is none of the choices of its field."""
     for name, hint in get_type_hints(type(options)).items():
@@ -147,8 +130,12 @@ class CommonTraining(Options):
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """Return the names in ``learn``, of which "auto" stands for exposure if the photographs differ."""
-        return learned_names(self.learn)
+        """Return the names in ``learn``, checked. "none" is (); "auto" is exposure if the photographs differ."""
+        names = tuple(self.learn.split(",")) if isinstance(self.learn, str) else self.learn
+        for name in names if names != ("none",) else ():
+            if name not in ("auto", *QUANTITIES.builtin):
+                raise RecipeError(f"--learn: {QUANTITIES.unknown(name, also=('auto', 'none'))}")
+        return names if names != ("none",) else ()
 
 
 @dataclass(frozen=True, kw_only=True)

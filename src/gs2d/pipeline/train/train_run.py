@@ -81,75 +81,63 @@ def train(
         If options, capture or machine do not allow the run; the message says what to do.
     """
     with connected(options.backend) as together:
+        use_threads(options.threads, together.place.local_size)
+        use_memory(memory_of(together.place, options.memory))
         if isinstance(together, ManyProcesses) and not together.leads:
-            use_threads(options.threads, together.place.local_size)
-            use_memory(memory_of(together.place, options.memory))
             return follow(options, together)
-        return _train(options, on_event, together, title, allowed, part)
+        check_viewer(options)
+        check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
+        heard: list[Event] = []
 
+        def listen(event: Event) -> None:
+            heard.append(event)
+            on_event(event)
 
-def _train(
-    options: TrainOptions,
-    on_event: OnEvent,
-    together: OneProcess,
-    title: str,
-    allowed: tuple[str, ...],
-    part: TrainedPart | None,
-) -> RunFolder:
-    """Train in this process, which leads the others if there are any."""
-    check_viewer(options)
-    check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
-    use_threads(options.threads, together.place.local_size)
-    use_memory(memory_of(together.place, options.memory))
-    heard: list[Event] = []
-
-    def listen(event: Event) -> None:
-        heard.append(event)
-        on_event(event)
-
-    loaded = prepare_run(options, listen, title=title, part=part)
-    if options.overwrite and options.cache is not None:  # before the old run is deleted
-        remove_made(make_folder(options.cache))
-    run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
-    with run.locked(), discard_on_failure(run), watched(loaded, on_event) as live:
-        tell = on_event if live is None else live.on_event
-        if options.cache is not None:  # an unusable folder fails here, not after the first stage
-            run.made += make_folder(options.cache)
-        if is_run(run.path):
-            check_same_run(run, loaded.resolved)
-            if run.file(EDITS).exists():
-                raise RunError(
-                    f"the splats of {run.path} were edited, and --resume would replace them; undo the edits with "
-                    f"`{again('edit', run.path, '--undo')}`, or train into another --out"
-                )
-            if run.file(SPLATS).exists() and not run.checkpoints():
-                raise RunError(
-                    f"{run.path} is finished and has no checkpoints to resume; train it again with --overwrite, or "
-                    "choose another --out"
-                )
-        else:
-            run.write_definition(loaded.resolved.to_json())
-        loaded = lead(loaded, together, tell)
-        start = choose_start(run, loaded, tell)
-        if start.state is None:
-            tell(Notice(_training_line(loaded)))
-            if part is None:
-                known = None if loaded.init is None else len(loaded.init)
-                needed = estimate(loaded.scene, loaded.recipe, loaded.backend, downscale=loaded.downscale, start=known)
-                tell(Notice(needed.line()))
-            for event in heard:
-                if isinstance(event, Notice) and event.detail:
-                    run.events.append({"kind": Notice.kind, "text": event.text})
-        hold()
-        if part is not None:
-            train_stages(run, loaded, start, tell, live=live)
-            release(loaded.scene)
-            return run
-        collected = Collector(loaded.scene)
-        splats, now = train_stages(run, loaded, start, tell, collected, together, live)
-        release(loaded.scene)  # before the volume of the mesh
-        finish(run, replace(loaded, scene=now), splats, tell, collected)
-    return run
+        loaded = prepare_run(options, listen, title=title, part=part)
+        if options.overwrite and options.cache is not None:  # before the old run is deleted
+            remove_made(make_folder(options.cache))
+        run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
+        with run.locked(), discard_on_failure(run), watched(loaded, on_event) as live:
+            tell = on_event if live is None else live.on_event
+            if options.cache is not None:  # an unusable folder fails here, not after the first stage
+                run.made += make_folder(options.cache)
+            if is_run(run.path):
+                check_same_run(run, loaded.resolved)
+                if run.file(EDITS).exists():
+                    raise RunError(
+                        f"the splats of {run.path} were edited, and --resume would replace them; undo the edits with "
+                        f"`{again('edit', run.path, '--undo')}`, or train into another --out"
+                    )
+                if run.file(SPLATS).exists() and not run.checkpoints():
+                    raise RunError(
+                        f"{run.path} is finished and has no checkpoints to resume; train it again with --overwrite, or "
+                        "choose another --out"
+                    )
+            else:
+                run.write_definition(loaded.resolved.to_json())
+            loaded = lead(loaded, together, tell)
+            start = choose_start(run, loaded, tell)
+            if start.state is None:
+                tell(Notice(_training_line(loaded)))
+                if part is None:
+                    known = None if loaded.init is None else len(loaded.init)
+                    needed = estimate(
+                        loaded.scene, loaded.recipe, loaded.backend, downscale=loaded.downscale, start=known
+                    )
+                    tell(Notice(needed.line()))
+                for event in heard:
+                    if isinstance(event, Notice) and event.detail:
+                        run.events.append({"kind": Notice.kind, "text": event.text})
+            hold()
+            if part is not None:
+                train_stages(run, loaded, start, tell, live=live)
+                release(loaded.scene)
+                return run
+            collected = Collector(loaded.scene)
+            splats, now = train_stages(run, loaded, start, tell, collected, together, live)
+            release(loaded.scene)  # before the volume of the mesh
+            finish(run, replace(loaded, scene=now), splats, tell, collected)
+        return run
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +20,8 @@ POSES_JSON, POSES_PNG = "poses.json", "poses.png"  # of a capture that `gs2d pos
 @register_section("capture", title="Cameras")
 def capture_section(run: RunRecord) -> str | None:
     """Return the result of structure from motion; None for a capture whose cameras came from elsewhere."""
-    scene = run.definition.get("scene")
-    stated = Path(str(scene.get("path"))) if isinstance(scene, Mapping) and scene.get("path") else run.path
-    folder = next((f for f in (run.path / CAPTURE, stated) if (f / POSES_JSON).is_file()), None)
+    folders = (run.path / CAPTURE, Path(run.definition["scene"]["path"]))
+    folder = next((folder for folder in folders if (folder / POSES_JSON).is_file()), None)
     if folder is None:
         return None
     pixels, unreadable = _image(folder / POSES_PNG)

@@ -33,19 +33,17 @@ def _subject_facts(run: RunRecord) -> list[tuple[str, str]]:
 
 def _facts(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return names and values; what ``run.json`` does not have is left out."""
-    scene, backend = definition.get("scene"), definition.get("backend")
+    scene, backend = definition["scene"], definition.get("backend")
     pairs = [(name.capitalize(), name_of(definition[name])) for name in ("recipe", "protocol") if name in definition]
-    if isinstance(scene, Mapping):
-        pairs.append(("Capture", f"{scene.get('name')} ({scene.get('format', 'unknown format')})"))
-        pairs.append(("Views", f"{scene.get('train', '?')} training, {scene.get('test', '?')} test"))
-        pairs += [("Skipped", ", ".join(map(str, scene["skipped"])))] if scene.get("skipped") else []
+    pairs.append(("Capture", f"{scene['name']} ({scene['format']})"))
+    pairs.append(("Views", f"{scene['train']} training, {scene['test']} test"))
+    pairs += [("Skipped", ", ".join(scene["skipped"]))] if scene.get("skipped") else []
     if backend:
-        details = backend.get("details") if isinstance(backend, Mapping) else ""
-        pairs.append(("Backend", name_of(backend) + (f" ({details})" if details else "")))
+        pairs.append(("Backend", backend["name"] + (f" ({backend['details']})" if backend.get("details") else "")))
     for name in ("seed", "downscale", "created"):
         pairs += [(name.capitalize(), str(definition[name]))] if definition.get(name) is not None else []
     for name in ("machine", "versions"):
-        values = definition.get(name)
-        if isinstance(values, Mapping):
-            pairs.append((name.capitalize(), ", ".join(f"{key} {value}" for key, value in values.items())))
+        pairs.append(
+            (name.capitalize(), ", ".join(f"{key} {value}" for key, value in definition.get(name, {}).items()))
+        )
     return pairs
