@@ -84,7 +84,6 @@ def train_both(folder: Path, args: argparse.Namespace) -> None:
         "backend": "cpu",
         "threads": args.threads,
         "page": False,
-        "whole_scene": True,
     }
 
     def tell(event: object) -> None:

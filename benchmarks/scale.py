@@ -107,7 +107,7 @@ def surface_splats(capture: Path, count: int) -> Splats:
 def train_arguments(capture: Path, run: Path, args: argparse.Namespace) -> list[str]:
     """Return the options of a short training with a fixed number of splats."""
     words = ["train", capture, "--out", run, "--overwrite", "--init", capture / "start.ply", "--recipe", "2dgs"]
-    words += ["--robust", "off", "--set", "surface.densify=null", "--quiet", "--scene"]
+    words += ["--robust", "off", "--set", "surface.densify=null", "--quiet"]
     words += ["--schedule-scale", args.iterations / ITERATIONS_OF_ALL, "--memory", args.memory]
     words += ["--threads", args.threads]
     return [str(word) for word in words]

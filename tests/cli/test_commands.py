@@ -6,13 +6,11 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from cli_runs import TINY
 from gs2d.cli import run
 from gs2d.config.presets import RECIPES
-from gs2d.data.image_files import read_image
 from tiny import write_ball_mesh
 
 
@@ -79,32 +77,6 @@ def test_the_ending_of_an_export_is_its_format_and_info_reads_it(
     assert (facts["splats"], facts["bytes"]) == (result["splats"], result["bytes"])
     assert facts["layout"].startswith(layout)
     assert facts["shape"] == "flat"
-
-
-def test_the_splats_of_a_file_are_drawn_and_meshed_with_the_cameras_of_a_run(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    glb, folders = tmp_path / "a.glb", [tmp_path / "own", tmp_path / "of_file"]
-    assert run(["export", str(trained), "--out", str(glb), "--quiet"]) == 0
-    words = ["--split", "train", "--threads", "1", "--quiet"]
-    assert run(["render", str(trained), "--out", str(folders[0]), *words]) == 0
-    assert run(["render", str(trained), "--out", str(folders[1]), "--splats", str(glb), *words]) == 0
-    own, of_file = ([read_image(path) for path in sorted(folder.iterdir())] for folder in folders)
-    assert len(own) == len(of_file) > 0
-    assert max(int(np.abs(a.astype(int) - b).max()) for a, b in zip(own, of_file, strict=True)) <= 1
-    mesh = ["mesh", str(trained), "--threads", "1", "--splats", str(glb)]
-    assert run([*mesh, "--out", str(tmp_path / "m.ply"), "--quiet"]) == 0
-    assert (tmp_path / "m.ply").stat().st_size > 100
-    for words, message in (
-        (mesh, "--splats needs --out: files in the run are made from its own splats"),
-        ([*mesh, "--out", str(trained / "mesh.ply")], "is the mesh of the run's own splats"),
-        ([*mesh, "--texture"], "--texture needs the mesh of the run"),
-        (["render", str(trained), "--splats", str(glb)], "--splats needs --out"),
-        (["render", str(trained), "--splats", str(trained), "--out", str(tmp_path / "x")], "got the folder"),
-    ):
-        assert run(words) == 2
-        assert message in capsys.readouterr().err
-    assert not (tmp_path / "x").exists()
 
 
 def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(

@@ -48,7 +48,6 @@ def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytes
     [
         (["nowhere"], "folder"),
         (["cloud.ply", "--out", "cloud.png"], ".html file"),
-        (["cloud.ply", "--bbox", *"0 0 0 1 1 1".split()], "leave them out"),
     ],
 )
 def test_input_that_cannot_become_a_page_is_a_one_line_error(

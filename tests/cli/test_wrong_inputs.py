@@ -161,7 +161,7 @@ MISSPELT = (
     *([command, "photoz", "--out", "new"] for command in ("train", "blocks", "poses", "reconstruct")),
     ["export", "photoz", "--out", "new.ply"],
     *(["train", "capture", "--out", "new", option, "photoz"] for option in ("--masks", "--init")),
-    ["mesh", "run", "--splats", "photoz", "--out", "new.ply"],
+    ["mesh", "--splats", "photoz", "--out", "new.ply"],
     ["evaluate", "run", "--ground-truth", "photoz"],
     ["survey", "run", "--positions", "photoz"],
     ["sweep", "best", "--data", "photoz", "--out", "new"],

@@ -110,7 +110,7 @@ LINES = (
     "train CAPTURE --out RUN --set surface.densify.max_splats=150 --threads 2 --checkpoint-every 100 --resume",
     "mesh RUN --voxel 0.01 --set depth=median --texture --set texture_size=512",
     "render RUN --split test --out FOLDER --orbit 30",
-    "export RUN --out a.spz --format spz --bbox -1 -1 -1 1 1 1",
+    "export RUN --out a.spz --format spz",
     "edit RUN --merge OTHER --transform 2 90 0 0 0 0 1.5 --out b.ply",
     "evaluate RUN --mesh-gt a.ply --json",
     "poses PHOTOS --out CAPTURE",

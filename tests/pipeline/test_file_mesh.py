@@ -150,7 +150,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     one_view = write_capture(tmp_path / "capture", size=16, train=1, test=0)
     cases = {
         (): "expected the folder of a run, got none",
-        ("--splats", file): "--splats without a run needs --out FILE",
+        ("--splats", file): "--splats needs --out FILE",
         ("--splats", file, "--texture", "--out", out): "expected the folder of a run",
         ("--splats", empty, "--out", out): "must contain splats, got an empty file",
         ("--splats", tmp_path / "none.ply", "--out", out): "none.ply",

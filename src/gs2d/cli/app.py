@@ -210,5 +210,5 @@ def _resumed(argv: Sequence[str]) -> str:
 def _interrupted(argv: Sequence[str], command: Common) -> int:
     """Print how to continue an interrupted command."""
     line = f"interrupted; resume with: {_resumed(argv)}" if isinstance(command, HowItRuns) else "interrupted"
-    print(printable(line + command.after_interrupt(argv)), file=sys.stderr)
+    print(printable(line), file=sys.stderr)
     return INTERRUPTED

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,6 @@ from typing import Annotated
 from gs2d.cli.command_registry import BEGIN, LOOK, MEASURE, STEPS, register_command
 from gs2d.config.arguments import Arg
 from gs2d.pipeline.prepare.options import (
-    BoxOption,
     EditOptions,
     EvaluateOptions,
     MeshOptions,
@@ -35,10 +33,6 @@ class Common:
     """Print every decision, and the traceback of an error. Without it, most decisions are only in events.jsonl."""
     json: bool = False
     """Print the result as JSON on stdout."""
-
-    def after_interrupt(self, words: Sequence[str]) -> str:
-        """Return what to say after Ctrl-C, beyond "interrupted"; ``words`` is the command line."""
-        return ""
 
 
 @register_command(
@@ -85,13 +79,13 @@ class MeshCommand(TextureOptions, MeshOptions, Resources, Common):
     """Extract the mesh of a run again, with other settings; or that of a file of splats."""
 
     run: Annotated[Path | None, Arg(metavar="RUN", positional=True)] = None
-    """Run folder. Not needed with --splats."""
+    """Run folder."""
     out: Path | None = None
     """Mesh file (default: mesh.ply in the run, or mesh.glb with --texture)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Use the splats of this file, in the frame of the run if there is one. Needs --out."""
+    """Mesh the splats of this file instead of a run. Needs --out."""
     cameras: Annotated[Path | None, Arg(metavar="CAPTURE")] = None
-    """With --splats and no RUN: capture with the cameras of the splats (default: viewpoints around the subject)."""
+    """With --splats: capture with the cameras of the splats (default: viewpoints around the subject)."""
     texture: bool = False
     """Write a textured mesh, as .glb or .obj, from the photographs. Without options that change the mesh, uses
     mesh.ply."""
@@ -113,8 +107,6 @@ class RenderCommand(RenderOptions, Resources, Common):
     """Run folder."""
     out: Path | None = None
     """Folder of the images (default: renders/SPLIT or renders/orbit in the run)."""
-    splats: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Use the splats of this file, in the frame of the run. Needs --out."""
     threads: int | None = None
     """CPU threads."""
 
@@ -159,8 +151,6 @@ class ExportCommand(Common):
     """Format: html (a page that works offline in any browser), 2dgs (of the 2DGS paper), 3dgs (opens in common
     viewers), compressed, spz, spz4, splat, usd, gltf, sog, streamed, or one of a package (default: by the ending of
     --out; .ply is 3dgs)."""
-    bbox: BoxOption = None
-    """Export only splats whose centre is in this box. `gs2d view` shows its numbers."""
 
 
 @register_command("edit", action="gs2d.cli.handlers:edit", group=LOOK)

@@ -37,8 +37,8 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
     """``gs2d mesh``."""
     from gs2d.pipeline.finish.run_mesh import mesh_run
 
-    if command.cameras is not None and command.run is not None:
-        raise RunError("--cameras is for --splats without a run, which has cameras of its own; leave one of them out")
+    if command.run is not None and (command.splats, command.cameras) != (None, None):
+        raise RunError("--splats and --cameras mesh a file instead of a run, got both; leave one of them out")
     _keep_to(command.memory)
     options = MeshOptions(**values(MeshOptions, command))
     if command.run is not None and command.texture:
@@ -47,7 +47,7 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
     _refuse_texture_options(command)
     out, threads = command.out, command.threads
     if command.run is not None:
-        result = mesh_run(command.run, options, console.on_event, out=out, splats_file=command.splats, threads=threads)
+        result = mesh_run(command.run, options, console.on_event, out=out, threads=threads)
     elif command.splats is not None and not command.texture:
         from gs2d.pipeline.file_mesh import mesh_file
 
@@ -63,8 +63,6 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
 def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console: Console) -> None:
     from gs2d.pipeline.finish.run_texture import texture_run
 
-    if command.splats is not None:
-        raise ProtocolError("--texture needs the mesh of the run; leave out --splats or --texture")
     if command.collision or command.lods != 1:
         raise ProtocolError("--texture writes neither convex pieces nor lods; run `gs2d mesh` again without --texture")
     result = texture_run(
@@ -100,7 +98,6 @@ def render(command: c.RenderCommand, console: Console) -> None:
         command,
         console.on_event,
         out=command.out,
-        splats_file=command.splats,
         threads=command.threads,
     )
     console.say(f"{result['images']} images in {result['folder']}")
@@ -149,7 +146,7 @@ def export(command: c.ExportCommand, console: Console) -> None:
         return
     if command.out is None:
         raise RunError("gs2d export needs --out FILE, whose ending selects the format")
-    result = export_run(command.run, command.out, command.format, bbox=command.bbox)
+    result = export_run(command.run, command.out, command.format)
     console.say(
         f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, format {result['layout']}"
     )
@@ -161,8 +158,8 @@ def export(command: c.ExportCommand, console: Console) -> None:
 def _export_page(command: c.ExportCommand, console: Console) -> None:
     from gs2d.pipeline.look.page import page_run
 
-    if command.format not in (None, "html") or command.bbox is not None:
-        raise RunError("an .html page takes neither another --format nor --bbox; leave them out")
+    if command.format not in (None, "html"):
+        raise RunError("an .html page takes no other --format; leave it out")
     result = page_run(command.run, command.out, on_event=console.on_event)
     console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
     console.result(result)

@@ -20,7 +20,7 @@ from gs2d.data.subject_box import OBJECT
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.pipeline.finish.run_mesh import check_mesh_options, checked_mesh_file, extract_mesh
-from gs2d.pipeline.finish.run_subject import subject_in, subject_line, wants_subject, within
+from gs2d.pipeline.finish.run_subject import centers_inside, subject_in, subject_line, wants_subject
 from gs2d.pipeline.finish.viewpoints import choose_viewpoints
 from gs2d.pipeline.in_memory import Trained
 from gs2d.pipeline.look.page import settings_without_run
@@ -60,7 +60,7 @@ def mesh_file(
         If a file, the capture or an option is invalid.
     """
     if out is None:
-        raise RunError("--splats without a run needs --out FILE, the mesh to write")
+        raise RunError("--splats needs --out FILE, the mesh to write")
     check_mesh_options(options)
     out = checked_mesh_file(Path(splats_file).parent, Path(out), options)
     check_writable(out)
@@ -68,7 +68,7 @@ def mesh_file(
     splats, kind = read_surfels(splats_file, lambda text: on_event(Notice(text)))
     on_event(Notice(f"{len(splats):,} splats: {kind}", detail=True))
     if options.bbox is not None:
-        within(splats, options.bbox)
+        centers_inside(splats, options.bbox, "--bbox")
     if cameras is None:
         loaded, box = _around(splats, on_event)
         options = replace(options, refine=False)  # there are no photographs

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gs2d.cli.command_registry import MEASURE, STEPS, register_command
@@ -33,7 +31,3 @@ class BlocksCommand(BlocksOptions, Common):
 @dataclass(frozen=True, kw_only=True)
 class SweepCommand(SweepOptions, Common):
     """Compare recipes on scenes and seeds, as a table; or reproduce a table of the paper."""
-
-    def after_interrupt(self, words: Sequence[str]) -> str:
-        """Return the command that continues."""
-        return f"; continue with: gs2d {shlex.join(words)}" if self.train else ""

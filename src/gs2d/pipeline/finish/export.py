@@ -10,26 +10,21 @@ from gs2d.errors import RunError
 from gs2d.io.formats.splat_formats import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
 from gs2d.io.gaussians import Tell
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.pipeline.finish.run_subject import within
 from gs2d.pipeline.prepare.loaded import checked_output, finished_splats
-from gs2d.pipeline.prepare.options import Box
 
 
-def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None) -> dict[str, Any]:
+def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, Any]:
     """Write the splats of a run, or of a file of flat splats, in another format.
 
     Parameters
     ----------
     layout : str or None
         A name in ``io.formats.splat_formats.LAYOUTS``; None: by the ending of ``out``.
-    bbox : six floats, optional
-        Only splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
     """
     path, out = Path(path), Path(out)
     layout = checked_layout(path, out, layout)
     notes: list[str] = []
     splats = splats_of(path, notes.append)
-    splats = splats if bbox is None else within(splats, bbox)
     notes += write_layout(out, splats, layout)
     size = written_bytes(out, layout)
     return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes}

@@ -168,19 +168,15 @@ def render_run(
     on_event: OnEvent = ignore,
     *,
     out: Path | None = None,
-    splats_file: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Render the views of a split or an orbit as PNG files, and optionally as a video.
-
-    ``splats_file`` is drawn instead of the splats of the run, into ``out``.
-    """
+    """Render the views of a split or an orbit as PNG files, and optionally as a video."""
     from gs2d.io.video import write_video
 
     path, out = Path(path), None if out is None else Path(out)
     check_frames(options)
     video = options.video
-    run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
+    run, loaded, splats = open_finished(path, threads, on_event)
     kind, views = _views(path, options, loaded, on_event)
     if options.width is not None:
         views = [(name, replace(view, camera=_at_width(view.camera, options.width))) for name, view in views]

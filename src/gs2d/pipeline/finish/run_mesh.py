@@ -19,7 +19,7 @@ from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.reach import Reach
 from gs2d.data.subject_box import LARGEST, Subject, checked_box
-from gs2d.errors import ProtocolError, RunError
+from gs2d.errors import ProtocolError
 from gs2d.io.meshes import write_mesh, write_pieces
 from gs2d.io.run_dir import MESH, SURFACE, TEXTURED, RunFolder
 from gs2d.meshing.convex_pieces import convex_pieces, required
@@ -295,24 +295,15 @@ def mesh_run(
     on_event: OnEvent = ignore,
     *,
     out: Path | None = None,
-    splats_file: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Extract the mesh of a finished run; return its file, counts and limits.
-
-    Parameters
-    ----------
-    splats_file : Path or None
-        Mesh the splats of this file into ``out``.
-    """
+    """Extract the mesh of a finished run; return its file, counts and limits."""
     path, out = Path(path), None if out is None else Path(out)
     checked_mesh_file(path, path / MESH if out is None else out, options)
-    run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
+    run, loaded, splats = open_finished(path, threads, on_event)
     if out is not None and out.resolve() != run.file(MESH).resolve():
         subject = meshed_subject(run, loaded, splats, options, on_event)
         return extract_mesh(loaded, splats, options, out, on_event, subject=subject)
-    if splats_file is not None:
-        raise RunError(f"--out {out} is the mesh of the run's own splats; choose another name")
     with run.locked():
         subject = meshed_subject(run, loaded, splats, options, on_event)
         result = extract_mesh(loaded, splats, options, run.file(MESH), on_event, subject=subject)

@@ -76,7 +76,7 @@ def subject_of(
 def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | None = None) -> Subject:
     """Return the subject of a scene without reading or writing files; errors are as in :func:`subject_of`."""
     if box is not None:
-        within(splats, box, "--subject-box")
+        centers_inside(splats, box, "--subject-box")
     try:
         cameras = [view.camera for view in loaded.scene.train]
         return find_subject(sights(loaded, splats)) if box is None else given_subject(box, cameras)
@@ -103,11 +103,6 @@ def wants_subject(loaded: RenderedScene, options: MeshOptions) -> bool:
     }
     check_subject_box(box, others)
     return box is not None or (loaded.protocol.fusion.subject and not any(others.values()))
-
-
-def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Splats:
-    """Return the splats with their centres in a box; errors are as in :func:`centers_inside`."""
-    return splats.rows(centers_inside(splats, box, option))
 
 
 def centers_inside(splats: Splats, box: Sequence[float], option: str) -> Tensor:

@@ -21,7 +21,7 @@ from gs2d.data.known_captures import missing_lines
 from gs2d.data.masks import EMPTY
 from gs2d.errors import DataError, RunError
 from gs2d.io import splat_ply
-from gs2d.io.formats.splat_formats import read_splats, read_surfels
+from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
@@ -274,31 +274,13 @@ def finished_splats(run: RunFolder) -> Splats:
     return splats
 
 
-def open_finished(
-    path: Path, threads: int | None, on_event: OnEvent, *, splats_file: Path | None = None, out: Path | None = None
-) -> tuple[RunFolder, LoadedRun, Splats]:
-    """Return a finished run, loaded, with its splats on the device of its backend.
-
-    Parameters
-    ----------
-    splats_file : Path or None
-        Use the splats of this file, in the frame of the run.
-    out : Path or None
-        Output, required with ``splats_file``: files in the run are made from its own splats.
-    """
+def open_finished(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, LoadedRun, Splats]:
+    """Return a finished run, loaded, with its splats on the device of its backend."""
     use_threads(threads)
     run = open_run(path)
-    splats = finished_splats(run) if splats_file is None else _splats_of(Path(splats_file), out, on_event)
+    splats = finished_splats(run)
     loaded = reload_run(run, on_event)
     return run, loaded, splats.to(loaded.backend.device)
-
-
-def _splats_of(path: Path, out: Path | None, on_event: OnEvent) -> Splats:
-    if out is None:
-        raise RunError("--splats needs --out: files in the run are made from its own splats; name another path")
-    if path.is_dir():
-        raise DataError(f"--splats must be a file of splats, got the folder {path}; use the splats.ply in it")
-    return read_splats(path, lambda text: on_event(Notice(text)))
 
 
 def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "the file") -> Path:

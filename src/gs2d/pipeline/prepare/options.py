@@ -120,10 +120,6 @@ class CommonTraining(Options):
     """Iterations (500) or time (90s, 10m) between checkpoints."""
     page: bool = True
     """Do not write scene.html, the splats as a page for any browser."""
-    subject_box: BoxOption = None
-    """Box of the subject, which is meshed (default: what most cameras look at)."""
-    whole_scene: Annotated[bool, Arg(name="scene")] = False
-    """Mesh everything, not only the subject, in voxels that grow with distance."""
     masked: Literal["ignore", "empty", "off"] | None = None
     """Meaning of black mask pixels: ignore (not used), empty (transparent), or off (masks are not used) (default:
     ignore, or by protocol)."""

@@ -21,7 +21,6 @@ from gs2d.config.robust import FEW_VIEWS
 from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides
 from gs2d.data import Scene
-from gs2d.data.subject_box import check_subject_box
 from gs2d.errors import ProtocolError, RecipeError
 from gs2d.losses.base import losses_of
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points
@@ -111,7 +110,6 @@ def check_execution(options: TrainOptions) -> None:
     if options.downscale is not None and options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     checkpoint_interval(options.checkpoint_every)
-    check_subject_box(options.subject_box, {"--scene": options.whole_scene})
 
 
 def checkpoint_interval(every: str | int) -> tuple[int | None, float | None]:

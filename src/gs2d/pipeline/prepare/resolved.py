@@ -15,7 +15,6 @@ from gs2d.data import Scene
 from gs2d.data.masks import Masks
 from gs2d.errors import DataError, RecipeError, RunError, ShapeError
 from gs2d.io.run_dir import RUN_JSON, RunFolder
-from gs2d.pipeline.prepare.options import Box
 from gs2d.render.api import check_settings
 from gs2d.render.types import RasterSettings
 
@@ -77,8 +76,6 @@ class Execution:
     checkpoint_every: str | int = "2m"
     cache: Path | None = None
     page: bool = True
-    subject_box: Box | None = None
-    whole_scene: bool = False
     viewer: int | None = None
 
 

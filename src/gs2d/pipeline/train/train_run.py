@@ -231,13 +231,12 @@ def _training_line(loaded: LoadedRun) -> str:
 
 def finish(run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent, collected: Collector) -> None:
     """Write mesh, page, verdict and report of a run; a failure of one does not prevent the others."""
-    execution = loaded.resolved.execution
-    mesh = MeshOptions(subject_box=execution.subject_box, whole_scene=execution.whole_scene)
+    mesh = MeshOptions()
     with attempted_file(run, MESH, on_event):
         subject = meshed_subject(run, loaded, splats, mesh, on_event)
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
             keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject))
-    if execution.page and not run.file(PAGE).exists():
+    if loaded.resolved.execution.page and not run.file(PAGE).exists():
         with attempted_file(run, PAGE, on_event):
             page_run(run.path, on_event=on_event, loaded=loaded)
     with attempted_file(run, VERDICT, on_event):
