@@ -179,7 +179,7 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
 
     scene = with_predicted(learned or job.scene)
     views = scene.test or scene.train
-    scores = score_views(splats, views, job.settings, job.backend, name="", on_event=ignore)
+    scores = score_views(splats, views, job.settings, job.backend, ignore)
     summary = dict(summary_of(scores) or {})
     summary.pop("psnr_by_view", None)
     size = float(splats.scales.max()) / job.scene.extent

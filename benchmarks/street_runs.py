@@ -226,7 +226,7 @@ def score_run(path: Path) -> dict[str, Any]:
     scene = with_predicted(job.scene)
 
     def scores(views: Sequence[View]) -> dict[str, Any] | None:
-        return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore))
+        return summary_of(score_views(splats, views, *drawing, ignore))
 
     return {
         "test": scores(scene.test),

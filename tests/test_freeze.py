@@ -36,7 +36,7 @@ def counted() -> dict[str, int]:
 
 LIMITS = {
     "commands": 16,
-    "options of all commands": 257,
+    "options of all commands": 249,
     "options by name": 72,
     "settings by name": 21,
     "recipes": 22,

@@ -62,7 +62,7 @@ def test_the_transforms_are_written_and_their_mean_is_the_identity(run: RunFolde
 
 def test_training_views_are_scored_in_their_exposures(run: RunFolder) -> None:
     _, job, splats = open_finished(run.path, 1, ignore)
-    drawing = {"settings": job.settings, "backend": job.backend, "name": "", "on_event": ignore}
+    drawing = {"settings": job.settings, "backend": job.backend, "on_event": ignore}
     last = run.metrics()["stages"][-1]
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         plain, own = (

@@ -67,7 +67,7 @@ def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, t
     for view, before in zip(job.scene.test, given.test, strict=True):
         assert np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
     # Scored while it trained, scored again, and drawn.
-    drawing = {"settings": job.settings, "backend": job.backend, "name": "", "on_event": ignore}
+    drawing = {"settings": job.settings, "backend": job.backend, "on_event": ignore}
     psnr = run.metrics()["stages"][-1]["train"]["psnr"]
     own = mean_metrics(list(score_views(splats, job.scene.train, **drawing).values()))  # type: ignore[arg-type]
     assert own.to_json()["psnr"] == psnr

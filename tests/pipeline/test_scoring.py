@@ -13,7 +13,7 @@ from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.pipeline.finish.run_verdict import Collector
-from gs2d.pipeline.finish.scoring import ScoreOptions, mean_psnr, score_views
+from gs2d.pipeline.finish.scoring import mean_psnr, score_views
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 
@@ -41,7 +41,7 @@ def test_the_mean_psnr_of_the_curve_equals_that_of_the_full_scores() -> None:
         View.from_arrays("nothing counts", camera, noise, mask=np.zeros((12, 12), bool)),
         View.from_arrays("equal: infinite", away, np.zeros((12, 12, 3), np.uint8)),
     ]
-    scores = score_views(splats, views, settings, backend, name="", on_event=lambda event: None)
+    scores = score_views(splats, views, settings, backend, lambda event: None)
     values = [scores[name].psnr_float.value for name in ("noise", "half")]
     assert [scores[view.name].psnr_float.value for view in views[2:]] == [None, None]
     assert values[0] != values[1]
@@ -74,8 +74,7 @@ def test_transparent_pixels_are_counted_where_training_photographs_are_opaque_an
     assert 0 < half != every
     for split in ("train", "test"):
         counter = Collector(cast(Scene, SimpleNamespace(observed=lambda **_: None)))
-        options = ScoreOptions(split=split, visitors=[counter.visit])
-        score_views(wall, views, settings, backend, name="", on_event=lambda _: None, options=options)
+        score_views(wall, views, settings, backend, lambda _: None, split=split, visitors=[counter.visit])
         if split == "test":
             assert counter.transparent() == {}
             continue

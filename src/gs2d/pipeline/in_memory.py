@@ -18,7 +18,7 @@ from gs2d.evaluation.image_metrics import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.finish.run_mesh import fused
 from gs2d.pipeline.finish.run_subject import subject_in, wants_subject
-from gs2d.pipeline.finish.scoring import ScoreOptions, score_views
+from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.open_capture import capture_in_memory
 from gs2d.pipeline.prepare.options import MeshOptions, Training
 from gs2d.pipeline.prepare.predicted_exposure import with_predicted
@@ -186,8 +186,7 @@ def evaluate(
     views = scene.test if split == "test" else scene.train
     if not views:
         raise DataError(f"scene {scene.name} has no {split} views; load it with test_every=8, or use split='train'")
-    options, name = ScoreOptions(lpips=lpips, split=split), f"scoring {split} views"
-    scores = score_views(finished.splats, views, *drawing, name=name, on_event=on_event, options=options)
+    scores = score_views(finished.splats, views, *drawing, on_event, split=split, lpips=lpips)
     return mean_metrics(list(scores.values()))
 
 

@@ -23,7 +23,7 @@ from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
-from gs2d.pipeline.finish.scoring import ScoreOptions, peak_memory, score_views, split_metrics
+from gs2d.pipeline.finish.scoring import peak_memory, score_views, split_metrics
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import TrainOptions, values
@@ -140,15 +140,8 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     collected = Collector(scene)
     hold()
     for split, views in (("train", seen.train), ("test", seen.test)):
-        scores = score_views(
-            splats,
-            views,
-            loaded.settings,
-            loaded.backend,
-            name=f"scoring {split} views",
-            on_event=on_event,
-            options=ScoreOptions(split=split, visitors=[collected.visit]),
-        )
+        drawing, seen_by = (loaded.settings, loaded.backend), [collected.visit]
+        scores = score_views(splats, views, *drawing, on_event, split=split, visitors=seen_by)
         entry |= split_metrics(scores, split)
     shown = choose_views(seen)
     with attempted(f"images of {STAGE}", None, on_event):

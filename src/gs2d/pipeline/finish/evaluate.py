@@ -13,7 +13,7 @@ from gs2d.io.run_dir import MESH, SURFACE, VERDICT
 from gs2d.pipeline.attempts import attempted_file
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
-from gs2d.pipeline.finish.scoring import ScoreOptions, score_views, split_metrics
+from gs2d.pipeline.finish.scoring import score_views, split_metrics
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import with_predicted
@@ -48,9 +48,7 @@ def evaluate_run(
 
     scene, collected = with_predicted(loaded.scene), Collector(loaded.scene)
     for split, views in (("train", scene.train), ("test", scene.test)):
-        chosen = ScoreOptions(lpips=lpips, split=split, visitors=[collected.visit])
-        name = f"scoring {split} views"
-        scores = score_views(splats, views, *drawing, name=name, on_event=on_event, options=chosen)
+        scores = score_views(splats, views, *drawing, on_event, split=split, lpips=lpips, visitors=[collected.visit])
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
     if truth is not None and has_mesh:

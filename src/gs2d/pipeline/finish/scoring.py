@@ -52,56 +52,41 @@ Visitor = Callable[[RenderedPhotograph, ImageMetrics], None]
 """Receives each view with its scores; must not keep the images."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoreOptions:
-    """How views are scored.
-
-    Attributes
-    ----------
-    split : str
-        Passed to ``visitors``.
-    lpips : Lpips or None
-    visitors : sequence of Visitor
-    """
-
-    split: str = ""
-    lpips: Lpips | None = None
-    visitors: Sequence[Visitor] = ()
-
-
 def score_views(
     splats: Splats,
     views: Sequence[View],
     settings: RasterSettings,
     backend: Backend,
-    *,
-    name: str,
     on_event: OnEvent,
-    options: ScoreOptions = ScoreOptions(),
+    *,
+    split: str = "",
+    lpips: Lpips | None = None,
+    visitors: Sequence[Visitor] = (),
 ) -> dict[str, ImageMetrics]:
-    """Return the image metrics of each view by its name, as a phase called ``name``.
+    """Return the image metrics of each view by its name; ``split`` is passed to the visitors.
 
     Views are rendered with the appearance of their photographs, if known. Masked pixels are ignored.
     """
+    rendered = _rendered(splats, views, settings, backend, split)
     scores: dict[str, ImageMetrics] = {}
-    for seen in counted(_rendered(splats, views, settings, backend, options), name, len(views), on_event):
-        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=options.lpips)
+    for seen in counted(rendered, f"scoring {split} views", len(views), on_event):
+        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=lpips)
         scores[seen.view.name] = metrics
-        for visit in options.visitors:
+        for visit in visitors:
             visit(seen, metrics)
     return scores
 
 
 def mean_psnr(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> float | None:
     """Return the mean PSNR of views, of images that are not rounded to 8 bits."""
-    rendered = _rendered(splats, views, settings, backend, ScoreOptions())
+    rendered = _rendered(splats, views, settings, backend)
     values = [psnr_float(seen.image, seen.target, seen.mask) for seen in rendered]
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
 
 def _rendered(
-    splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend, options: ScoreOptions
+    splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend, split: str = ""
 ) -> Iterator[RenderedPhotograph]:
     settings = replace(settings, sh_degree=splats.sh_degree, with_distortion=False)
     for view in views:
@@ -111,7 +96,7 @@ def _rendered(
         pixels = view.mask()
         mask = None if pixels is None else torch.from_numpy(pixels).to(target.device)
         image = photographed(view, output.color, settings.background)
-        yield RenderedPhotograph(view, options.split, output, image, target, mask)
+        yield RenderedPhotograph(view, split, output, image, target, mask)
 
 
 def split_metrics(scores: dict[str, ImageMetrics], split: str) -> dict[str, Any]:

@@ -41,17 +41,6 @@ class ResumePoint:
     seconds: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class FinishedStage:
-    """A stage that another run trained: its final checkpoint, and metrics and log up to there."""
-
-    index: int
-    payload: dict[str, Any]
-    metrics: list[dict[str, Any]]
-    log: bytes
-    source: str
-
-
 def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
     """Return the furthest valid start; log and metrics are cut to it.
 
@@ -64,11 +53,10 @@ def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> Resume
     if run.checkpoints():
         return _resume(run, loaded, on_event)
     run.events.cut(0)
-    stage = None if cache is None else _from_cache(loaded, cache, on_event)
-    if stage is None:
-        run.write_metrics({"stages": [], "surface": None})
-        return ResumePoint()
-    return _adopt(run, loaded, stage, on_event)
+    if cache is not None and (start := _from_cache(run, loaded, cache, on_event)) is not None:
+        return start
+    run.write_metrics({"stages": [], "surface": None})
+    return ResumePoint()
 
 
 def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
@@ -108,18 +96,11 @@ def _unreadable(path: Path, reason: str) -> RunError:
     return RunError(f"{path} is not a readable checkpoint ({' '.join(reason.split())[:300]}); delete it")
 
 
-def _state(path: Path, payload: dict[str, Any]) -> TrainState:
-    """Return the state of a checkpoint."""
-    try:
-        return TrainState.from_state_dict(payload["state"])
-    except RunError as error:
-        raise _unreadable(path, str(error)) from error
-
-
 def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], loaded: LoadedRun) -> TrainState:
     """Return the state of a checkpoint, if it matches the name of its file and training can resume from it."""
-    state, ended = _state(checkpoint.path, payload), checkpoint.iteration is None
+    ended = checkpoint.iteration is None
     try:
+        state = TrainState.from_state_dict(payload["state"])
         check_resumable(state, loaded.recipe, loaded.scene)
     except (RunError, ShapeError) as error:
         raise _unreadable(checkpoint.path, str(error)) from error
@@ -129,49 +110,46 @@ def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], loaded: Loade
 
 
 # -- stages in a cache -------------------------------------------------------------------------------------------------
-def _adopt(run: RunFolder, loaded: LoadedRun, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
-    """Copy the finished stages of another run into this one."""
-    name = loaded.recipe.stages[stage.index].name
-    run.events.append_text(stage.log)
-    run.write_metrics({"stages": [{**m, "reused_from": stage.source} for m in stage.metrics], "surface": None})
-    payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
-    run.save_checkpoint(stage.index, name, None, payload)
-    on_event(Notice(f"stages up to {name!r} are reused from {stage.source}"))
-    return ResumePoint(_state(Path(stage.source), stage.payload))
-
-
 def _cache_file(folder: Path, key: str) -> Path:
     return folder / f"{key[:32]}.pt"
 
 
-def _from_cache(loaded: LoadedRun, folder: Path, on_event: OnEvent) -> FinishedStage | None:
-    """Return the last stage that the cache has; damaged files are deleted."""
+def _from_cache(run: RunFolder, loaded: LoadedRun, folder: Path, on_event: OnEvent) -> ResumePoint | None:
+    """Copy the finished stages of another run into this one, as far as the cache has them; delete damaged files."""
     sweep(folder)
-    for index in reversed(range(len(loaded.recipe.stages))):
-        key = loaded.stage_key(index)
-        path = _cache_file(folder, key)
-        if path.exists():
-            try:
-                return _cached(loaded, index, path, key)
-            except RunError as error:
-                on_event(Notice(f"{error}: deleted, the stage is trained again"))
-                with contextlib.suppress(OSError):
-                    path.unlink()
+    for index, stage in reversed(list(enumerate(loaded.recipe.stages))):
+        path = _cache_file(folder, loaded.stage_key(index))
+        if not path.exists():
+            continue
+        try:
+            payload, state = _cached(loaded, index, path)
+        except RunError as error:
+            on_event(Notice(f"{error}: deleted, the stage is trained again"))
+            with contextlib.suppress(OSError):
+                path.unlink()
+            continue
+        run.events.append_text(payload.pop("log").encode())
+        metrics = [{**entry, "reused_from": str(path)} for entry in json.loads(payload.pop("metrics"))]
+        run.write_metrics({"stages": metrics, "surface": None})
+        run.save_checkpoint(index, stage.name, None, {k: v for k, v in payload.items() if k != "events_bytes"})
+        on_event(Notice(f"stages up to {stage.name!r} are reused from {path}"))
+        return ResumePoint(state)
     return None
 
 
-def _cached(loaded: LoadedRun, index: int, path: Path, key: str) -> FinishedStage:
-    """Return a stage from a file of the cache."""
+def _cached(loaded: LoadedRun, index: int, path: Path) -> tuple[dict[str, Any], TrainState]:
+    """Return a checked file of the cache, and its state."""
     payload = _read(path)
-    _state_at(CheckpointFile(path, index, loaded.recipe.stages[index].name, None), payload, loaded)
+    state = _state_at(CheckpointFile(path, index, loaded.recipe.stages[index].name, None), payload, loaded)
     try:
-        metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
+        metrics = json.loads(payload["metrics"])
+        payload["log"].encode()
     except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise _unreadable(path, f"{type(error).__name__}: {error}") from error
     check_shape(path, {"stages": metrics}, METRICS_SHAPE, "delete it")
-    if payload["key"] != key or len(metrics) != index + 1:
+    if payload["key"] != loaded.stage_key(index) or len(metrics) != index + 1:
         raise _unreadable(path, "it is of another stage")
-    return FinishedStage(index, payload, metrics, log, str(path))
+    return payload, state
 
 
 def put_in_cache(folder: Path, run: RunFolder, index: int, payload: dict[str, Any]) -> None:

@@ -15,7 +15,6 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import (
-    ScoreOptions,
     Visitor,
     mean_psnr,
     score_views,
@@ -124,9 +123,8 @@ class StageResults:
     def _score(self, split: str, visitors: Sequence[Visitor]) -> dict[str, ImageMetrics]:
         scene, loaded = self._shown_scene(), self._loaded
         views = scene.train if split == "train" else scene.test
-        options = ScoreOptions(split=split, visitors=visitors)
-        drawing, name = (loaded.settings, loaded.backend), f"scoring {split} views"
-        return score_views(self._trainer.drawn, views, *drawing, name=name, on_event=self._on_event, options=options)
+        drawing = (loaded.settings, loaded.backend)
+        return score_views(self._trainer.drawn, views, *drawing, self._on_event, split=split, visitors=visitors)
 
     def _draw(self, stage: str) -> None:
         drawn, state = self._trainer.drawn, self._trainer.state
