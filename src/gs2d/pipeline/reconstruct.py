@@ -47,7 +47,6 @@ from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_wo
 from gs2d.training.events import Notice, OnEvent, ignore
 
 CAPTURE = "capture"
-GENERIC_NAMES = ("images", "photos", "photographs", "pictures")  # of folders: the report is named by the parent
 
 
 def poses_options(options: ReconstructOptions) -> PosesOptions:
@@ -101,8 +100,8 @@ def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
 
 def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
     """Train on the capture in the run folder; texture the mesh if requested."""
-    training = replace(train_options(options), overwrite=False)
-    run = train(training, on_event, title=_title(options.photos.resolve()), allowed=_allowed(options))
+    training, photos = replace(train_options(options), overwrite=False), options.photos.resolve()
+    run = train(training, on_event, title=photos.stem if is_video(photos) else photos.name, allowed=_allowed(options))
     if options.texture and not run.file(TEXTURED).exists():
         with attempted_file(run, TEXTURED, on_event):
             if not run.file(MESH).exists():
@@ -114,13 +113,6 @@ def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
 def _allowed(options: ReconstructOptions) -> tuple[str, ...]:
     """Return the names that may be in the run folder before training begins."""
     return (CAPTURE, hidden_workspace(options.out / CAPTURE).name)
-
-
-def _title(photos: Path) -> str:
-    """Return the title of the report."""
-    if is_video(photos):
-        return photos.stem
-    return photos.parent.name if photos.name.lower() in GENERIC_NAMES and photos.parent.name else photos.name
 
 
 # -- checks ------------------------------------------------------------------------------------------------------------

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
 from gs2d.data.subject_box import read_subject
-from gs2d.report.html_parts import render
+from gs2d.report.html_parts import macro
 from gs2d.report.run_record import RunRecord, name_of
 from gs2d.report.sections.section_registry import register_section
 
 
 @register_section("settings", title="Settings")
 def settings_section(run: RunRecord) -> str | None:
-    """Return the main settings of the run, then ``run.json`` and ``metrics.json`` in full."""
-    raw = {
-        "run.json": json.dumps(run.definition, indent=2, ensure_ascii=False),
-        "metrics.json": json.dumps({"stages": run.stages, "surface": run.surface}, indent=2, ensure_ascii=False),
-    }
-    return render("settings.html", facts=[*_facts(run.definition), *_subject_facts(run)], raw=raw)
+    """Return the main settings of the run; all of them are in ``run.json``."""
+    return macro("macros.html", "facts", [*_facts(run.definition), *_subject_facts(run)])
 
 
 def _subject_facts(run: RunRecord) -> list[tuple[str, str]]:
