@@ -37,7 +37,7 @@ def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Pa
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_an_internal_error_is_exit_code_1_with_a_traceback_only_for_debug(
+def test_an_internal_error_is_exit_code_1_with_a_traceback_only_with_verbose(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from gs2d.pipeline.finish import evaluate
@@ -108,7 +108,7 @@ def test_a_second_ctrl_c_does_not_interrupt_the_cleanup(
     monkeypatch.setattr(Trainer, "step", lambda _self: os.kill(os.getpid(), signal.SIGINT))
     monkeypatch.setattr(RunFolder, "discard", impatient)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
-    assert one_line(capsys.readouterr().err).startswith(RESUME)
+    assert capsys.readouterr().err.startswith(RESUME)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -149,7 +149,7 @@ def test_ctrl_c_before_the_first_iteration_leaves_no_run(
 
     monkeypatch.setattr(Trainer, "step", interrupted)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
-    assert one_line(capsys.readouterr().err).startswith(RESUME)
+    assert capsys.readouterr().err.startswith(RESUME)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -168,10 +168,10 @@ def _print_traceback(error: BaseException) -> None:
 
 def _report(error: Exception, verbose: bool) -> int:
     """Print an error and return its exit code."""
-    if verbose:
-        _print_traceback(error)
     if isinstance(error, Gs2dError):
         return _fail(str(error))
+    if verbose:
+        _print_traceback(error)
     if isinstance(error, OSError) and error.errno in _USER_ERRORS:
         return _fail(f"{error.strerror}: {error.filename or 'no file named'}; fix that and run the command again")
     message = str(error) if isinstance(error, RuntimeError | ImportError | OSError) else ""

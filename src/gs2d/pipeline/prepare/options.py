@@ -124,6 +124,10 @@ class CommonTraining(Options):
     """Meaning of black mask pixels: ignore (not used), empty (transparent), or off (masks are not used) (default:
     ignore, or by protocol)."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "checkpoint_every", str(self.checkpoint_every))
+
     @property
     def learned(self) -> tuple[str, ...]:
         """Return the names in ``learn``, checked. "none" is (); "auto" is exposure if the photographs differ."""

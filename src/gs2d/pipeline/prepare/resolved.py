@@ -73,7 +73,7 @@ class Execution:
 
     threads: int | None = None
     memory: float | None = None
-    checkpoint_every: str | int = "2m"
+    checkpoint_every: str = "2m"
     cache: Path | None = None
     page: bool = True
     viewer: int | None = None
