@@ -15,6 +15,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.image_files import write_image
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
+from gs2d.pipeline.finish.run_images import camera_json
 from gs2d.report.color_maps import depth_image, error_image, highlight_image, normal_image
 
 STAGES = (("surface", 3000), ("appearance", 1000), ("refine", 2000))
@@ -106,7 +107,8 @@ def write_renders(folder: Path, width: int, height: int) -> None:
         stripes = np.sin(40 * hits.depth)[..., None] * [0.2, 0.15, -0.1] + [0.6, 0.4, 0.3]
         photo = stripes * alpha[..., None] + 1 - alpha[..., None]
         name = f"{split}/r_{k}"
-        views.append({"name": name, "file": name.replace("/", "__"), "split": split, "depth_limits": [1.5, 4.25]})
+        view = {"name": name, "file": name.replace("/", "__"), "split": split, "depth_limits": [1.5, 4.25]}
+        views.append({**view, "camera": camera_json(camera)})
         (folder / "renders" / "photos").mkdir(parents=True, exist_ok=True)
         write_image(folder / "renders" / "photos" / f"{split}__r_{k}.png", photo)
         for index, (stage, _) in enumerate(STAGES):

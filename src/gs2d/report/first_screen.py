@@ -21,7 +21,7 @@ def first_screen(run: RunRecord, guard: Guard) -> str:
     verdict = guard("verdict", lambda: read_verdict(run.path))
     found = guard("gallery", lambda: read_gallery(run.path / RENDERS))
     gallery = found if isinstance(found, Gallery) else None
-    cameras = [view.camera for view in gallery.views if view.camera is not None] if gallery is not None else []
+    cameras = [] if gallery is None else [view.camera for view in gallery.views]
     pair = found if isinstance(found, str) else guard("comparison with a photograph", lambda: _pair(gallery))
     mesh = guard("view of the mesh", lambda: mesh_view(run.path, cameras))
     known = verdict if isinstance(verdict, Mapping) else {}

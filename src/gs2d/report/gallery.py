@@ -25,8 +25,8 @@ class ShownView:
     name: str
     file: str
     split: str
+    camera: Camera
     depth_limits: tuple[float, float] | None = None
-    camera: Camera | None = None
 
     @property
     def kind(self) -> str:
@@ -79,8 +79,8 @@ def _shown_view(entry: dict[str, Any]) -> ShownView:
     """Return an entry of ``views``."""
     name, limits = entry["name"], entry.get("depth_limits")
     depth_limits = None if limits is None else (float(limits[0]), float(limits[1]))
-    camera = Camera(**entry["camera"]) if "camera" in entry else None
-    return ShownView(str(name), str(entry.get("file", name)), str(entry.get("split", "")), depth_limits, camera)
+    file, split = str(entry.get("file", name)), str(entry.get("split", ""))
+    return ShownView(str(name), file, split, Camera(**entry["camera"]), depth_limits)
 
 
 def compared(gallery: Gallery, view: ShownView, *, width: int = 800) -> Pair | None:
