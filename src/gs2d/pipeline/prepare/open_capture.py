@@ -140,17 +140,19 @@ def _load_shrunk(
     masks = Masks(options.masks, options.masked)
     downscale = options.downscale or _downscale_of_resumed(options)
     notices: list[Event] = []
-    scene = read_scene(options.scene, scene_format, downscale or 1, protocol, notices.append, masks)
+
+    def load(factor: int, *lines: str) -> Scene:
+        notices[:] = map(Notice, lines)
+        return read_scene(options.scene, scene_format, factor, protocol, notices.append, masks)
+
+    scene = load(downscale or 1)
     if downscale is None:
         downscale = 1 if quality is None else quality.downscale([view.camera for view in scene.views])
-        if downscale > 1:
-            notices.clear()
-            scene = read_scene(options.scene, scene_format, downscale, protocol, notices.append, masks)
+        scene = load(downscale) if downscale > 1 else scene
         fitting, need = least_downscale(scene, downscale, on_host=backend.on_host)
         if fitting is not None and fitting > downscale:
             downscale = fitting
-            notices[:] = [Notice(f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")]
-            scene = read_scene(options.scene, scene_format, fitting, protocol, notices.append, masks)
+            scene = load(fitting, f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")
     for event in notices:
         on_event(event)
     check_memory(scene, downscale, on_host=backend.on_host)
