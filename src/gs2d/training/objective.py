@@ -186,19 +186,6 @@ class FullRender:
         given = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
         return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
 
-    def _compared(self, index: int, camera: Camera, target: Target) -> LossView:
-        """Return what the losses compare with a rendering of training view ``index``."""
-        return LossView(
-            target.image,
-            camera,
-            target.mask,
-            index=index,
-            depth_kind=self.protocol.depth,
-            silhouette=target.silhouette,
-            flatness=target.flatness,
-            target_mean=target.mean,
-        )
-
     def differentiate(self, state: TrainState, stage: Stage, iteration: int, rendered: Rendered) -> StepResult:
         """Return the weighted losses of a rendered view, and the gradients of the leaves that the stage trains.
 
@@ -218,7 +205,18 @@ class FullRender:
         if numbers:
             output = replace(output, color=shown(output.color, numbers, at, clipped_pixels(target)))
         before = sum(earlier.iterations for earlier in self.recipe.stages[: state.stage])
-        view = replace(self._compared(index, camera, target), iteration=iteration, run_iteration=before + iteration)
+        view = LossView(
+            target.image,
+            camera,
+            target.mask,
+            iteration,
+            run_iteration=before + iteration,
+            index=index,
+            depth_kind=self.protocol.depth,
+            silhouette=target.silhouette,
+            flatness=target.flatness,
+            target_mean=target.mean,
+        )
         resolved = self.protocol.resolve(stage.losses)
         terms = compute_losses(output, view, resolved, backend=self.backend, losses=self.losses)
         terms |= self.learned.penalties(numbers, index)
