@@ -43,7 +43,7 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
         ("train.train_run.extract_mesh", ProtocolError("no depth"), "mesh.ply", "no depth", "gs2d mesh {run}"),
         ("train.train_run.extract_mesh", MemoryError("much"), "mesh.ply", "out of memory", "gs2d mesh {run}"),
         (
-            "train.train_run.report_run",
+            "finish.run_report.report_run",
             OSError("broken data stream"),
             "report.html",
             "fault in gs2d: OSError: broken data stream",
@@ -87,7 +87,7 @@ def test_a_failing_result_is_reported_and_the_others_are_made(
 
 def test_a_full_disk_ends_the_run(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = disk_error(finished / "report.html", OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr("gs2d.pipeline.train.train_run.report_run", failing(full))
+    monkeypatch.setattr("gs2d.pipeline.finish.run_report.report_run", failing(full))
     with pytest.raises(DiskError, match="No space left"):
         train(options(capture, finished, resume=True))
 

@@ -13,7 +13,7 @@ import pytest
 from gs2d.config import grades
 from gs2d.config.grades import GOOD, USABLE
 from gs2d.core.json_files import write_json
-from gs2d.errors import DataError
+from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish.run_verdict import Finding, Measures, ViewMeasures, judge, spread_pixels
 from gs2d.render.api import rasterize
@@ -151,7 +151,7 @@ def test_the_report_begins_with_the_verdict(tmp_path: Path) -> None:
     assert '<span class="grade poor">poor</span>' in html
     assert "Take more photographs" in html
     write_json(path, {"verdict": {"grade": "good"}})
-    with pytest.raises(DataError, match=r"verdict\.json is damaged"):
+    with pytest.raises(RunError, match=r"verdict\.json was damaged"):
         verdict_section(run)
 
 
