@@ -21,7 +21,7 @@ from gs2d.training.start.plane_sweep import BARE, SWEEP_BYTES, SmallView, Sweep,
 
 WAITING = 500_000  # points that are collected before they are thinned
 MARGIN = 5.0  # px between them and known ones: small gaps close by themselves, and dark recesses are often narrow
-CLOSED_AGREE = 0.03  # interpolated depths of two views agree when they differ by at most this fraction
+CLOSED_AGREE = 0.015  # interpolated depths of two views agree when they differ by at most this fraction
 CLOSED_CELL = 2.0  # cells of swept points: interpolated ones are sparser, since they have no detail
 REPEATED = 3.0  # cells: nearer to a swept point, a sparse point starts no splat of its own
 
