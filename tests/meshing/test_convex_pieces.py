@@ -42,5 +42,5 @@ def test_an_empty_mesh_is_refused() -> None:
 
 def test_a_missing_package_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "coacd", None)
-    with pytest.raises(BackendError, match=r"collision=true needs coacd, which is not installed; pip install 'coacd"):
+    with pytest.raises(BackendError, match=r"--collision needs coacd, which is not installed; pip install 'coacd"):
         convex_pieces(Mesh(*block((0, 0, 0), (1, 1, 1))))

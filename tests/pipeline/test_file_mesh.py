@@ -157,7 +157,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ("--splats", file, "--out", tmp_path / "mesh.xyz"): "--out must name a .ply file",
         ("--splats", file, "--out", out, "--set", "lods=2"): "lods=2 needs --out FILE.glb",
         ("--splats", file, "--out", out, "--set", "lods=0"): "lods must be a whole number >= 1, got 0",
-        ("--splats", file, "--out", out, "--set", "error=-1"): "error must be a number of pixels >= 0, got -1",
+        ("--splats", file, "--out", out, "--error", "-1"): "--error must be a number of pixels >= 0, got -1",
         ("--splats", file, "--out", out, "--bbox", *"5 5 5 6 6 6".split()): "--bbox contains none of the 50 splats",
         ("--splats", file, "--out", out, "--cameras", tmp_path): "must hold",
         ("--splats", file, "--out", out, "--cameras", one_view): "training cameras with different centres, got 1",

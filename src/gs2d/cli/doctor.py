@@ -14,7 +14,7 @@ _EXTRAS = {  # extra -> (the commands that need it, its packages)
     "sfm": ("cameras of photographs (gs2d reconstruct, poses)", ("pycolmap",)),
     "geo": ("maps (gs2d survey --gps, --orthophoto)", ("pyproj", "tifffile")),
     "markers": ("printed markers (gs2d survey --markers)", ("opencv-python-headless",)),
-    "collision": ("convex pieces (gs2d mesh --set collision=true)", ("coacd",)),
+    "collision": ("convex pieces (gs2d mesh --collision)", ("coacd",)),
     "texture": ("textured meshes (--texture)", ("xatlas",)),
     "spz4": ("SPZ of version 4 (gs2d export --format spz4)", ("zstandard",)),
     "usd": ("OpenUSD files (gs2d export --out x.usd)", ("usd-core",)),

@@ -23,7 +23,7 @@ def required() -> Any:
     BackendError
         If it is not installed.
     """
-    return extras.required("collision", "coacd", "collision=true", "leave it out")
+    return extras.required("collision", "coacd", "--collision", "leave --collision out")
 
 
 def convex_pieces(mesh: Mesh) -> list[Mesh]:
@@ -38,7 +38,7 @@ def convex_pieces(mesh: Mesh) -> list[Mesh]:
     """
     coacd = required()
     if not len(mesh.faces):
-        raise ProtocolError("collision=true needs a mesh with faces, got an empty mesh; extract it with other limits")
+        raise ProtocolError("--collision needs a mesh with faces, got an empty mesh; extract it with other limits")
     small = simplify(Mesh(mesh.vertices, mesh.faces), faces=FACES)
     vertices = small.vertices.astype(np.float64)
     middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0

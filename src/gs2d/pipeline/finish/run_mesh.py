@@ -160,7 +160,7 @@ def check_mesh_options(options: MeshOptions) -> None:
         if value is not None and not 1 / LARGEST <= value <= LARGEST:
             raise ProtocolError(f"{option} must be between {1 / LARGEST:g} and {LARGEST:g} world units, got {value:g}")
     if options.error is not None and not (options.error >= 0 and math.isfinite(options.error)):
-        raise ProtocolError(f"error must be a number of pixels >= 0, got {options.error}; 0 keeps all faces")
+        raise ProtocolError(f"--error must be a number of pixels >= 0, got {options.error}; 0 keeps all faces")
     if options.lods < 1:
         raise ProtocolError(f"lods must be a whole number >= 1, got {options.lods}")
     if options.collision:

@@ -250,11 +250,11 @@ class MeshOptions(Options):
     """Box of the subject, from now on (default: that of the run, or what most cameras look at)."""
     whole_scene: Annotated[bool, Arg(name="scene")] = False
     """Mesh everything, not only the subject, in voxels that grow with distance."""
-    error: Annotated[float | None, SETTING] = None
-    """Merge faces while the surface moves less than this in the nearest image, px (default: 0.25; data sets: 0)."""
+    error: Annotated[float | None, Arg(metavar="PIXELS")] = None
+    """Merge faces while the surface moves less than this in the nearest image (default: 0.25; data sets: keep all)."""
     refine: bool = True
     """Keep the fused surface, as for data sets; otherwise it moves until neighbouring photographs agree."""
-    collision: Annotated[bool, SETTING] = False
+    collision: bool = False
     """Also write convex pieces for collision tests: NAME-collision.obj beside the mesh (extra `collision`)."""
     lods: Annotated[int, SETTING] = 1
     """With --out FILE.glb: number of levels of detail in the file, each with four times the error (MSFT_lod)."""
