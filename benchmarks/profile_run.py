@@ -49,7 +49,7 @@ PARTS = (
     ),
     Rule("Adam", (("training/optimizer.py", ""),)),
     Rule("densification", (("training/densify/gradient.py", "densify_and_prune"),)),
-    Rule("densification statistics", (("training/densify/gradient.py", "accumulate"),)),
+    Rule("densification statistics", (("training/densify/gradient.py", "_add"),)),
     Rule("checks for NaN", (("training/objective.py", "first_not_finite"),)),
     Rule(
         "photographs",

@@ -16,6 +16,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import View, load_scene
 from gs2d.data.undistort import colmap_intrinsics, source_positions
 from gs2d.pipeline.finish import run_mesh as surface
+from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.events import ignore
@@ -103,7 +104,7 @@ def test_the_depth_of_invalid_pixels_is_not_fused(use_masks: bool) -> None:
         backend=get_backend("reference"),
         protocol=SimpleNamespace(use_mask_in_fusion=use_masks, fusion=SimpleNamespace(subject=False)),
     )
-    frame = next(iter(surface._frames(job, splat, "median", ignore, whole=True)))
+    frame = next(iter(surface._frames(job, splat, MeshOptions(depth="median", whole_scene=True), ignore)))
     assert frame.valid is not None
     assert frame.valid[:, 4:].any()
     assert not frame.valid[:, :4].any()

@@ -53,13 +53,13 @@ def test_an_invalid_ground_truth_is_an_error_before_the_run_is_read(
         evaluate_run(tmp_path / "no run", EvaluateOptions(ground_truth=file))
 
 
-def test_two_commands_cannot_render_into_the_same_folder(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_two_commands_cannot_render_into_a_run(undisturbed: RunFolder, tmp_path: Path) -> None:
     """The second would delete the frames of the first, which it then could not make a film of."""
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
     render_run(copy, RenderOptions(orbit=3), threads=1)
     with (
-        RunFolder(copy / "renders" / "orbit").locked(),
-        pytest.raises(RunError, match="--out"),
+        RunFolder(copy).locked(),
+        pytest.raises(RunError, match="process"),
     ):
         render_run(copy, RenderOptions(orbit=2), threads=1)
     assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 3

@@ -197,7 +197,7 @@ def test_a_known_distance_and_up(run: Path) -> None:
         (["--gps", "--epsg", "32632", "--set", "enu=true"], "exclude each other"),
         (["--known-distance", *"0 0 0 0 0 0 1".split()], "two different points"),
         (["--known-distance", *"0 0 0 1 0 0 -1".split()], "positive distance"),
-        (["--positions", "no-such.csv"], "expected a file at no-such.csv"),
+        (["--positions", "no-such.csv"], "no-such.csv, found nothing"),
         (["--control", "control.csv"], "has no photograph of that name|no photograph of"),
         (["--markers", "0"], "positive number"),
         (["--set", "up=0,0,0", "--gps"], "up must be a direction"),
