@@ -175,9 +175,10 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
     # Imported while the clocks are stopped: training does not need these modules.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.finish.scoring import score_views
-    from gs2d.pipeline.prepare.predicted_exposure import with_predicted
+    from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 
-    scene = with_predicted(learned or job.scene)
+    brightness = metered(splats, job.settings, job.backend)
+    scene = with_predicted(learned or job.scene, brightness)
     views = scene.test or scene.train
     scores = score_views(splats, views, job.settings, job.backend, ignore)
     summary = dict(summary_of(scores) or {})

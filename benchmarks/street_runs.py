@@ -39,7 +39,7 @@ from gs2d.pipeline.finish.run_subject import sights, surface_reach
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import FEW
-from gs2d.pipeline.prepare.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.reconstruct import CAPTURE
 from gs2d.render.api import rasterize
 from gs2d.sfm.photos import find_photos
@@ -223,7 +223,7 @@ def score_run(path: Path) -> dict[str, Any]:
     """
     _, job, splats = open_finished(path, None, ignore)
     drawing = (job.settings, job.backend)
-    scene = with_predicted(job.scene)
+    scene = with_predicted(job.scene, metered(splats, *drawing))
 
     def scores(views: Sequence[View]) -> dict[str, Any] | None:
         return summary_of(score_views(splats, views, *drawing, ignore))

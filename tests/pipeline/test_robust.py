@@ -128,6 +128,21 @@ def test_a_view_between_neighbours_with_similar_exposures_has_theirs() -> None:
     assert predicted(gains) == pytest.approx(gains[-1], abs=0.05)
 
 
+def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
+    """The gain that the last view of the ring would have, where the scene is so bright in each view."""
+    scene = ring(gains, test=1)
+    brightness = {view.name: float(value) for view, value in zip(scene.views, seen, strict=True)}
+    found = with_predicted(exposed(scene, gains), lambda view: brightness[view.name])
+    return float(found.test[0].appearance["exposure"][0, 0])
+
+
+def test_exposures_that_follow_brightness_are_predicted_from_it() -> None:
+    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)  # as if by chance: neighbours say nothing
+    gains = (seen + 0.02) ** -0.8
+    gains /= gains[:-1].mean()
+    assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.02)
+
+
 def test_another_removal_changes_stage_keys_and_runs(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     job = reload_run(run, lambda _: None)

@@ -21,7 +21,7 @@ from gs2d.pipeline.finish.run_subject import subject_in, wants_subject
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.open_capture import capture_in_memory
 from gs2d.pipeline.prepare.options import MeshOptions, Training
-from gs2d.pipeline.prepare.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import recipe_of, resolve
 from gs2d.pipeline.train.progress_bar import progress_bar
 from gs2d.render.backends import Backend
@@ -182,7 +182,7 @@ def evaluate(
     if split not in ("test", "train"):
         raise DataError(f"split must be 'test' or 'train', got {split!r}")
     drawing = (finished.settings, finished.backend)
-    scene = with_predicted(finished.scene)
+    scene = with_predicted(finished.scene, metered(finished.splats, *drawing))
     views = scene.test if split == "test" else scene.train
     if not views:
         raise DataError(f"scene {scene.name} has no {split} views; load it with test_every=8, or use split='train'")

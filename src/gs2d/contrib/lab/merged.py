@@ -27,7 +27,7 @@ from gs2d.pipeline.finish.scoring import peak_memory, score_views, split_metrics
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import TrainOptions, values
-from gs2d.pipeline.prepare.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance, write_appearance
 from gs2d.pipeline.train.train_run import finish
@@ -135,7 +135,7 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     loaded = merged_run(settled, options, scene)
     splats = read_splats(run.file(SPLATS)).to(loaded.backend.device)
     known = with_learned_appearance(run, loaded.recipe, scene)
-    seen = with_predicted(known)
+    seen = with_predicted(known, metered(splats, loaded.settings, loaded.backend))
     entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
     collected = Collector(scene)
     hold()

@@ -16,7 +16,7 @@ from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.finish.scoring import score_views, split_metrics
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
-from gs2d.pipeline.prepare.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
 
 
@@ -46,7 +46,7 @@ def evaluate_run(
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     drawing = (loaded.settings, loaded.backend)
 
-    scene, collected = with_predicted(loaded.scene), Collector(loaded.scene)
+    scene, collected = with_predicted(loaded.scene, metered(splats, *drawing)), Collector(loaded.scene)
     for split, views in (("train", scene.train), ("test", scene.test)):
         scores = score_views(splats, views, *drawing, on_event, split=split, lpips=lpips, visitors=[collected.visit])
         result |= split_metrics(scores, split)

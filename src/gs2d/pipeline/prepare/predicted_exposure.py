@@ -1,27 +1,65 @@
-"""Predict the exposure of views without a photograph, from neighbouring photographs.
+"""Predict the exposure of views without a photograph, from neighbouring photographs and the brightness of the view.
 
-Automatic cameras give similar views similar exposures. The prediction is weighted by how well each training photograph
-is predicted by the others (leave one out); without any gain it is the mean exposure. Test photographs are not used.
+Automatic cameras give similar views similar exposures, and bright views shorter ones: the logarithm of the exposure
+falls linearly with that of the brightness of the rendered scene. Both predictors are weighted by how well they predict
+each training photograph from the others (leave one out); without any gain the prediction is the mean exposure. Test
+photographs are not used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from gs2d.core.camera import Camera
-from gs2d.data import Scene
+from gs2d.core.splats import Splats
+from gs2d.data import Scene, View
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend
 from gs2d.render.exposure_transform import identity
+from gs2d.render.types import RasterSettings
 
 NEIGHBOURS = 5  # training photographs used by a prediction
 CLOSE = 0.02  # added to distances, in extents
 GREY = 0.5
+MAX_VARIANCE = 0.9  # brightness is used if its residual variance is below this times that of neighbours
+ENOUGH = 8  # training photographs to fit a line
+METERED = 256  # px, longer side of the rendering that is metered; smaller ones widen thin splats
+LUMA = (0.299, 0.587, 0.114)
+DARK = 0.02  # added to a brightness before its logarithm
+LEAST_GAIN = 0.05
+
+Brightness = Callable[[View], float]
 
 
-def with_predicted(scene: Scene) -> Scene:
-    """Return a scene with predicted exposures of test views; unchanged if training views have none."""
+def metered(splats: Splats, settings: RasterSettings, backend: Backend) -> Brightness:
+    """Return a function that measures the brightness of a view: the mean of its rendering in the mean exposure."""
+
+    def brightness(view: View) -> float:
+        camera = view.camera
+        small = METERED / max(camera.width, camera.height)
+        if small < 1:
+            camera = camera.resized(max(1, round(small * camera.width)), max(1, round(small * camera.height)))
+        with torch.no_grad():
+            color = rasterize(splats, camera, settings, backend=backend).color
+        return float((color.clamp_min(0).mean(dim=(0, 1)).double().cpu() * torch.tensor(LUMA).double()).sum())
+
+    return brightness
+
+
+def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
+    """Return a scene with predicted exposures of test views; unchanged if training views have none.
+
+    Parameters
+    ----------
+    scene : Scene
+        With the learned appearance of its training views.
+    brightness : callable, optional
+        See :func:`metered`; without it only neighbours are used.
+    """
     if not scene.test or any("exposure" not in view.appearance for view in scene.train):
         return scene
     cameras = [view.camera for view in scene.train]
@@ -30,12 +68,62 @@ def with_predicted(scene: Scene) -> Scene:
     greys = (GREY * offsets[:, :, :3].sum(dim=2) + offsets[:, :, 3]).mean(dim=1).numpy()  # [V] offset of grey
     around = np.stack([_weights(camera, cameras, scene.extent, without=i) for i, camera in enumerate(cameras)])
     trust = _trust(around @ greys, greys)
+    meter = None
+    if brightness is not None and len(cameras) >= ENOUGH:
+        seen = np.array([brightness(view) for view in scene.train])
+        meter = _Meter.fitted(seen, 1 + greys / GREY, around, trust)
     predicted = {}
     for view in scene.test:
         weights = _weights(view.camera, cameras, scene.extent)
         mean = (torch.from_numpy(weights)[:, None, None] * offsets).sum(dim=0)
-        predicted[view.name] = {"exposure": (identity(mean) + trust * mean).numpy()}
+        transform = identity(mean) + trust * mean
+        if meter is not None and brightness is not None:
+            own = 1 + float((GREY * transform[:, :3].sum(dim=1) + transform[:, 3] - GREY).mean()) / GREY
+            transform = transform * (meter.gain(brightness(view), weights) / max(own, LEAST_GAIN))
+        predicted[view.name] = {"exposure": transform.numpy()}
     return scene.with_appearance(predicted)
+
+
+@dataclass(frozen=True)
+class _Meter:
+    """Automatic exposure: log gain = level + slope (log brightness - middle), plus residuals of neighbours."""
+
+    level: float
+    slope: float
+    middle: float
+    residuals: np.ndarray  # [V] log gains minus the line, of the training views
+    trust: float  # in the residuals of neighbours
+
+    def gain(self, brightness: float, weights: np.ndarray) -> float:
+        """Return the gain of a view from its brightness and the weights [V] of its neighbours."""
+        line = self.level + self.slope * (np.log(max(brightness, 0.0) + DARK) - self.middle)
+        return float(np.exp(line + self.trust * (weights @ self.residuals)))
+
+    @classmethod
+    def fitted(cls, brightness: np.ndarray, gains: np.ndarray, around: np.ndarray, trust: float) -> _Meter | None:
+        """Fit the line to training views; None if it predicts no better than neighbours alone.
+
+        Parameters
+        ----------
+        brightness, gains : ndarray [V]
+        around : ndarray [V, V]
+            Weights of the others in a prediction of each.
+        trust : float
+            In neighbours alone.
+        """
+        x, y = np.log(np.maximum(brightness, 0.0) + DARK), np.log(np.maximum(gains, LEAST_GAIN))
+        middle, level = float(x.mean()), float(y.mean())
+        spread = float(((x - middle) ** 2).sum())
+        if spread <= 1e-9:
+            return None
+        slope = min(0.0, float(((x - middle) * (y - level)).sum()) / spread)  # more light: a shorter exposure
+        leverage = 1 / len(x) + (x - middle) ** 2 / spread
+        residuals = y - level - slope * (x - middle)
+        left_out = residuals / np.maximum(1 - leverage, 1e-6)  # from the line fitted to the other views
+        own = _trust(around @ residuals, residuals)
+        residual = np.mean((left_out - own * (around @ residuals)) ** 2)
+        by_neighbours = np.mean((y - trust * (around @ y)) ** 2)
+        return cls(level, slope, middle, residuals, own) if residual < MAX_VARIANCE * by_neighbours else None
 
 
 def _trust(predicted: np.ndarray, found: np.ndarray) -> float:

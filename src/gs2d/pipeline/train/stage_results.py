@@ -21,7 +21,7 @@ from gs2d.pipeline.finish.scoring import (
     split_metrics,
 )
 from gs2d.pipeline.prepare.loaded import LoadedRun
-from gs2d.pipeline.prepare.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_appearance import write_appearance
 from gs2d.pipeline.prepare.run_poses import write_poses
 from gs2d.pipeline.train.resume import put_in_cache
@@ -49,10 +49,12 @@ class StageResults:
     ) -> None:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
         self._collected = collected
+        self._predicted: tuple[tuple[int, int], Scene] | None = None  # with its stage and step
 
     def probe_psnr(self) -> float | None:
         """Return the mean PSNR of a few fixed views, test views if there are any."""
-        scene = self._shown_scene()
+        # Exposures are predicted from neighbours only: measuring brightness would render every photograph.
+        scene = with_predicted(self._trainer.scene_now())
         probes = scene.test or scene.train
         probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
         return mean_psnr(self._trainer.drawn, probes, self._loaded.settings, self._loaded.backend)
@@ -134,7 +136,11 @@ class StageResults:
 
     def _shown_scene(self) -> Scene:
         """Return the scene with its learned appearance, and predicted exposures of its test views."""
-        return with_predicted(self._trainer.scene_now())
+        at = (self._trainer.state.stage, self._trainer.state.step)
+        if self._predicted is None or self._predicted[0] != at:
+            brightness = metered(self._trainer.drawn, self._loaded.settings, self._loaded.backend)
+            self._predicted = (at, with_predicted(self._trainer.scene_now(), brightness))
+        return self._predicted[1]
 
     def _is_last(self, index: int) -> bool:
         return index == len(self._loaded.recipe.stages) - 1
