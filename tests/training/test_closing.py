@@ -40,6 +40,7 @@ def test_depth_does_not_cross_an_edge_of_the_photograph() -> None:
     np.testing.assert_allclose(closed, truth, rtol=0.1)  # the other surface is three times as far
 
 
+@pytest.mark.filterwarnings("error")
 def test_what_is_connected_to_nothing_known_has_no_depth() -> None:
     assert (closed_depth(np.zeros(SHAPE), np.zeros(SHAPE, bool), GREY, ALL) == 0).all()
     usable = ALL.copy()

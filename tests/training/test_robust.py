@@ -65,8 +65,7 @@ def test_a_sweep_finds_the_depth_of_a_textured_wall_only() -> None:
     assert valid.mean() > 0.8
     assert np.median(np.abs(depth[valid] / WALL - 1)) < 0.02  # a quarter of a pixel
     bare = sweep.depths[2][4:-4, 2:6]  # type: ignore[attr-defined]
-    assert (bare > 0).mean() < 0.4  # wide windows reach the texture beside it
-    np.testing.assert_allclose(bare[bare > 0], WALL, rtol=0.03)
+    assert (bare > 0).mean() < 0.1
 
 
 def test_training_starts_on_the_wall_facing_the_cameras() -> None:

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 EDGE = 0.02  # colour difference of neighbouring pixels, [0, 1], at which conduction falls to 1 / e; noise is below
-LEAK = 1e-3  # conduction across the strongest edge: each pixel gets a value
-GROUND = 1e-9  # conduction to nothing: pixels without any known one get the inverse depth 0
+LEAK = 1e-3  # conduction across the strongest edge: each pixel that is connected to a known one gets a value
 
 
 def closed_depth(depth: np.ndarray, known: np.ndarray, color: np.ndarray, usable: np.ndarray) -> np.ndarray:
@@ -35,18 +35,15 @@ def closed_depth(depth: np.ndarray, known: np.ndarray, color: np.ndarray, usable
     ndarray [H, W] world units
         0 where no known pixel is connected.
     """
-    if not known.any():
-        return np.zeros_like(depth)
-    links = _links(color, usable)
-    laplace = csr_array(diags_array(np.asarray(links.sum(axis=1)).ravel() + GROUND) - links)
-    fixed = known.ravel()
-    inverse = np.zeros(known.size)
-    inverse[fixed] = 1 / depth.ravel()[fixed]
-    if not fixed.all():
-        rows = laplace[~fixed]
-        inverse[~fixed] = spsolve(rows[:, ~fixed].tocsc(), -(rows[:, fixed] @ inverse[fixed]))
-    connected = inverse > GROUND / LEAK * inverse.max()
-    return np.asarray(np.where(connected, 1 / np.where(connected, inverse, 1.0), 0.0).reshape(depth.shape))
+    links, fixed = _links(color, usable), known.ravel()
+    laplace = csr_array(diags_array(np.asarray(links.sum(axis=1)).ravel()) - links)
+    part = connected_components(links, directed=False)[1]
+    free = np.isin(part, part[fixed]) & ~fixed
+    closed = np.where(fixed, depth.ravel(), 0.0)
+    if free.any():
+        rows = laplace[free]
+        closed[free] = 1 / spsolve(rows[:, free].tocsc(), -(rows[:, fixed] @ (1 / closed[fixed])))
+    return np.asarray(closed.reshape(depth.shape))
 
 
 def _links(color: np.ndarray, usable: np.ndarray) -> csr_array:
@@ -62,6 +59,7 @@ def _links(color: np.ndarray, usable: np.ndarray) -> csr_array:
         second.append(b.ravel())
         values.append((both * np.moveaxis(np.exp(-((change / EDGE) ** 2)) + LEAK, axis, 0)).ravel())
     i, j, v = map(np.concatenate, (first, second, values))
+    i, j, v = i[v > 0], j[v > 0], v[v > 0]
     both_ways = np.concatenate([i, j]), np.concatenate([j, i])
     return csr_array(coo_array((np.concatenate([v, v]), both_ways), shape=(count, count)))
 

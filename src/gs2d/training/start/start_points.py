@@ -29,7 +29,7 @@ REPEATED = 3.0  # cells: nearer to a swept point, a sparse point starts no splat
 def start_points(
     scene: Scene, sweep: Sweep, settings: DenseStart, around: tuple[np.ndarray, ...] | None = None
 ) -> PointCloud:
-    """Return points to start from: swept ones, and sparse ones that are far from those.
+    """Return points to start from: swept ones, interpolated ones, and sparse ones that are far from the swept ones.
 
     For a fitted start, sparse points keep the size that they have among all sparse points (:attr:`PointCloud.sizes`).
 
@@ -53,7 +53,7 @@ def start_points(
             "--set dense_start=null"
         )
     swept = _thinned((_swept(sweep, index) for index in range(len(sweep.views))), settings.cell)
-    between = _between(sweep, swept, settings.cell)
+    between = _between(sweep, swept, settings.cell, 0 if scene.ahead else cache_bytes(SWEEP_BYTES))
     parts: list[tuple[np.ndarray, ...]] = [
         (found.places, found.colors, found.normals, np.zeros(len(found.places))) for found in (swept, between)
     ]
@@ -140,8 +140,11 @@ def _found(view: SmallView, depth: np.ndarray, kept: np.ndarray, score: np.ndarr
     return _Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], score[kept])
 
 
-def _between(sweep: Sweep, swept: _Found, cell: float) -> _Found:
-    """Return interpolated points where no swept ones are: neighbours agree on them, and none sees through them."""
+def _between(sweep: Sweep, swept: _Found, cell: float, limit_bytes: int) -> _Found:
+    """Return interpolated points where no swept ones are: neighbours agree on them, and none sees through them.
+
+    Closed depth maps beyond ``limit_bytes`` are on the disk.
+    """
 
     def closed(index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the closed depth map, negative where it is interpolated, and the pixels that may start a splat."""
@@ -153,7 +156,7 @@ def _between(sweep: Sweep, swept: _Found, cell: float) -> _Found:
         return np.where(known, depth, -filled).astype(np.float32), wanted
 
     count, tree = len(sweep.views), cKDTree(swept.places)
-    depths = Spilled(map(closed, range(count)), cache_bytes(SWEEP_BYTES))
+    depths = Spilled(map(closed, range(count)), limit_bytes)
 
     def agreed(index: int) -> _Found:
         view, (signed, wanted) = sweep.views[index], depths[index]
