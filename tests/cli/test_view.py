@@ -36,7 +36,7 @@ def facts_of(page: bytes) -> dict[str, Any]:
     return dict(json.loads(page.decode().split('id="facts">')[1].split("</script>")[0]))
 
 
-def test_a_run_is_served_with_its_mesh_and_its_cameras(trained: Path, tmp_path: Path) -> None:
+def test_a_run_is_served_with_its_stages_its_mesh_and_its_cameras(trained: Path, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(trained, copy)
     write_ball_mesh(copy / "mesh.ply")
@@ -44,21 +44,26 @@ def test_a_run_is_served_with_its_mesh_and_its_cameras(trained: Path, tmp_path: 
     try:
         assert shown == ["cameras", "mesh", "splats"]
         facts = facts_of(fetch(server, "")[1])
+        stages = facts["offer"]["stages"]
         assert facts["offer"] == {
             "meshes": ["mesh"],
             "photographs": True,
             "served": True,
+            "stages": stages,
             "live": False,
         }
-        headers, data = fetch(server, "splats")
-        packed = json.loads(headers["X-Splats"])
-        assert len(data) == (32 + 16 * packed["texels"]) * packed["splats"] > 0
+        assert stages == ["surface", "appearance", "final"]
+        for stage in stages:
+            headers, data = fetch(server, "splats", stage=stage)
+            packed = json.loads(headers["X-Splats"])
+            assert len(data) == (32 + 16 * packed["texels"]) * packed["splats"] > 0
         assert fetch(server, "mesh")[1] == web_mesh(read_mesh(copy / "mesh.ply"))
         assert len(facts["cameras"]) == 3
         with Image.open(io.BytesIO(fetch(server, "photograph", view="2")[1])) as image:
             assert image.size == (20, 20)
-        with pytest.raises(urllib.error.HTTPError, match="400"):
-            fetch(server, "photograph", view="3")
+        for path, values in (("splats", {"stage": "other"}), ("photograph", {"view": "3"})):
+            with pytest.raises(urllib.error.HTTPError, match="400"):
+                fetch(server, path, **values)
         assert server.failure is None
         write_mesh(copy / "mesh.glb", TexturedMesh(np.eye(3), np.eye(3), np.array([[0, 1, 2]]),
                                                        np.zeros((3, 2)), np.zeros((4, 4, 3), np.uint8)))  # fmt: skip

@@ -170,7 +170,7 @@ def test_the_page_is_one_file_with_all_data_and_loads_nothing(tmp_path: Path) ->
     packed = pack_for(SCENE, some_splats())
     assert gzip.decompress(base64.b64decode(page.texts["splats"])) == data_of(packed)
     assert (facts["splats"], facts["texels"], facts["background"]) == (packed.count, 3, [0.2, 0.5, 0.9])
-    assert facts["offer"] == {"meshes": ["mesh"], "photographs": True, "served": False, "live": False}
+    assert facts["offer"] == {"meshes": ["mesh"], "photographs": True, "served": False, "stages": [], "live": False}
     assert gzip.decompress(base64.b64decode(page.texts["mesh"])) == MESH
     assert [base64.b64decode(line) for line in page.texts["photographs"].split()] == PHOTOGRAPHS
     for shader in SHADERS:
@@ -193,7 +193,7 @@ def test_the_most_important_splats_come_first() -> None:
 def served() -> Scripts:
     """A page as a server offers it."""
     page = Scripts()
-    page.feed(served_page(SCENE, PageOffer(("mesh", "textured"), True)).decode())
+    page.feed(served_page(SCENE, PageOffer(("mesh", "textured"), True, stages=("surface", "final"))).decode())
     return page
 
 

@@ -1,4 +1,4 @@
-"""The served page in a browser: mesh, photographs, live training; other sites get nothing."""
+"""The served page in a browser: stages, mesh, photographs, live training; other sites get nothing."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
+from gs2d.errors import DataError
 from gs2d.meshing.web_mesh import web_mesh
 from gs2d.render.types import RasterSettings
 from gs2d.viewer.packed_splats import pack_splats
@@ -60,7 +61,8 @@ class Training:
 
     def __init__(self, *, is_live: bool = False) -> None:
         self.version, self.status = 0, "training begins"
-        page = served_page(SCENE, PageOffer(() if is_live else ("mesh",), True, live=is_live))
+        stages = () if is_live else ("red", "broken", "blue")
+        page = served_page(SCENE, PageOffer(() if is_live else ("mesh",), True, stages=stages, live=is_live))
         self.server = PageServer(
             None,
             {
@@ -77,8 +79,10 @@ class Training:
         return {"version": self.version, "status": self.status}
 
     def splats(self, arguments: Mapping[str, str]) -> Answer:
-        color = ["blue", "red", "blue"][self.version]
-        return splats_answer(pack_splats(disc(color), ORIGIN, 0, SETTINGS.alpha_min))
+        stage = arguments.get("stage") or ["", "red", "blue"][self.version]
+        if stage not in COLORS:
+            raise DataError(f"{stage} cannot be read")
+        return splats_answer(pack_splats(disc(stage), ORIGIN, 0, SETTINGS.alpha_min))
 
     def photograph(self, arguments: Mapping[str, str]) -> Answer:
         file = io.BytesIO()
@@ -110,10 +114,18 @@ def _browser() -> None:
     require_browser()
 
 
-def test_the_mesh_and_photographs_are_requested_when_they_are_chosen() -> None:
+def test_stages_the_mesh_and_photographs_are_requested_when_they_are_chosen() -> None:
     with opened(Training()) as tab:
         tab.until("facts.splats === 1")
+        assert middle(tab) == "blue"  # the last stage
+        choose = "(name) => { $('stage').value = name; $('stage').onchange(); }"
+        tab.ask(f"({choose})('broken')")
+        tab.until("$('status').textContent === 'broken cannot be read'")
         assert middle(tab) == "blue"
+        tab.errors.clear()  # the browser's line about status 400
+        tab.ask(f"({choose})('red')")
+        tab.until("$('status').hidden")
+        assert middle(tab) == "red"
         tab.click("[data-show=mesh]")
         tab.until("meshes.mesh")
         assert middle(tab) == "green"

@@ -171,6 +171,8 @@ class RecipesCommand(Common):
 
     name: Annotated[str, Arg(positional=True)] = ""
     """Recipe to print."""
+    all: bool = False
+    """List all recipes, not only the three for everyday use."""
 
 
 @register_command("doctor", action="gs2d.cli.doctor:doctor", group=BEGIN)

@@ -14,7 +14,7 @@ from gs2d.core.processes import process_rank
 from gs2d.errors import ProtocolError, RunError
 from gs2d.pipeline.prepare.options import EditOptions, MeshOptions, TextureOptions, values
 
-EVERYDAY = ("best", "best-fast", "2dgs")  # listed first
+EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows without --all
 
 
 def _keep_to(gib: float | None) -> None:
@@ -186,11 +186,14 @@ def recipes(command: c.RecipesCommand, console: Console) -> None:
         console.say(json.dumps(shown, indent=2))
         console.result(shown)
         return
-    names = sorted((name for name, _ in RECIPES.working()), key=lambda name: name not in EVERYDAY)
-    width = max(map(len, names))
-    for name in names:
-        console.say(f"{name:<{width}}  {about_recipe(name)}")
-    console.result({name: about_recipe(name) for name in names})
+    names = {name: about_recipe(name) for name, _ in RECIPES.working()}
+    shown = {name: about for name, about in names.items() if command.all or name in (*EVERYDAY, *RECIPES.guests())}
+    width = max(map(len, shown))
+    for name, about in shown.items():
+        console.say(f"{name:<{width}}  {about}")
+    if len(shown) < len(names):
+        console.say(f"{len(names) - len(shown)} more recipes: --all")
+    console.result(names)
 
 
 def reconstruct(command: c.ReconstructCommand, console: Console) -> None:

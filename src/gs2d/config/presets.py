@@ -387,7 +387,7 @@ def get_recipe(name: str) -> Recipe:
         return read_recipe_file(name)
     if name not in RECIPES:
         near = did_you_mean(name, list(RECIPES))
-        raise RecipeError(f"no recipe {name!r}; `gs2d recipes` lists them{near}")
+        raise RecipeError(f"no recipe {name!r}; `gs2d recipes --all` lists them{near}")
     found = RECIPES.get(name)
     return found() if isinstance(found, NamedRecipe) else made_recipe(found, f"recipe {name!r}")
 

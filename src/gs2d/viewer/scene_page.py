@@ -104,6 +104,8 @@ class PageOffer:
         Whether there is a photograph for each view.
     served : bool
         Whether the data come from a server. False: they are embedded in the page.
+    stages : sequence of str
+        Stages whose splats a server offers.
     live : bool
         Whether the splats change.
     """
@@ -111,6 +113,7 @@ class PageOffer:
     meshes: Sequence[str] = ()
     photographs: bool = False
     served: bool = True
+    stages: Sequence[str] = ()
     live: bool = False
 
 

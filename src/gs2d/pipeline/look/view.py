@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 
+from gs2d.core.splats import Splats
 from gs2d.data import View
+from gs2d.errors import DataError
 from gs2d.io.meshes import read_mesh, read_textured
-from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
+from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, load_tensors
 from gs2d.meshing.web_mesh import web_mesh
 from gs2d.pipeline.look.page import page_content, photograph_jpeg
 from gs2d.training.events import OnEvent, Step, ignore
+from gs2d.training.state import TrainState
+from gs2d.viewer.packed_splats import PackedSplats
 from gs2d.viewer.page_server import Answer, PageServer, Route, number_in
-from gs2d.viewer.scene_page import PageOffer, pack_for, served_page, splats_answer
+from gs2d.viewer.scene_page import PageOffer, PageScene, pack_for, served_page, splats_answer
 
+FINAL = "final"
 PHOTOGRAPH_SIDE = 640  # px, longer side
 _TICK = 0.2  # s between checks for Ctrl-C
 
@@ -30,13 +36,17 @@ def open_viewer(path: Path, port: int | None = None, on_event: OnEvent = ignore)
         What the page shows: "cameras", "mesh", "splats".
     """
     content = page_content(path, on_event)
-    meshes = {} if content.run is None else _meshes_of(content.run)
-    packed = cache(lambda: pack_for(content.scene, content.splats))
+    stages: dict[str, Callable[[], Splats]] = {FINAL: lambda: content.splats}
+    meshes: dict[str, Callable[[], bytes]] = {}
+    if content.run is not None:
+        ends = [checkpoint for checkpoint in content.run.checkpoints() if checkpoint.iteration is None]
+        earlier = {end.stage: partial(_splats_of, end.path) for end in ends[:-1]}  # the last one is splats.ply
+        stages, meshes = {**earlier, **stages}, _meshes_of(content.run)
     has_photographs = bool(content.photographs)
-    page = served_page(content.scene, PageOffer(tuple(meshes), has_photographs))
+    page = served_page(content.scene, PageOffer(tuple(meshes), has_photographs, stages=tuple(stages)))
     routes: dict[str, Route] = {
         "": lambda _: Answer("text/html; charset=utf-8", [page]),
-        "splats": lambda _: splats_answer(packed()),
+        "splats": _stages_route(stages, content.scene),
         "photograph": photographs_route(content.photographs, content.scene.settings.background),
         **{name: partial(_mesh_answer, block) for name, block in meshes.items()},
     }
@@ -60,6 +70,27 @@ def photographs_route(views: Sequence[View], background: Sequence[float]) -> Rou
         return Answer("image/jpeg", [photograph_jpeg(view, background, PHOTOGRAPH_SIDE)])
 
     return answer
+
+
+def _stages_route(stages: Mapping[str, Callable[[], Splats]], scene: PageScene) -> Route:
+    lock = threading.Lock()
+
+    @lru_cache(maxsize=1)  # one stage in memory
+    def packed(stage: str) -> PackedSplats:
+        return pack_for(scene, stages[stage]())
+
+    def answer(arguments: Mapping[str, str]) -> Answer:
+        stage = arguments.get("stage", "")
+        if stage not in stages:
+            raise DataError(f"stage must be one of {', '.join(stages)}, got {stage[:40]!r}")
+        with lock:
+            return splats_answer(packed(stage))
+
+    return answer
+
+
+def _splats_of(checkpoint: Path) -> Splats:
+    return TrainState.from_state_dict(load_tensors(checkpoint)["state"]).splats
 
 
 def _meshes_of(run: RunFolder) -> dict[str, Callable[[], bytes]]:

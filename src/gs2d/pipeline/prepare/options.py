@@ -27,7 +27,7 @@ BoxOption = Annotated[Box | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
 Transform = tuple[float, float, float, float, float, float, float]
 Overrides = Annotated[tuple[str, ...], Arg(name="set", metavar="STAGE.FIELD=VALUE", repeated=True)]
 ViewerOption = Annotated[int | None, Arg(metavar="[PORT]", bare="0")]  # 0: the first free port
-PhotosPath = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
+Photos = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
 
 
 def values(kind: type[Any], options: Any) -> dict[str, Any]:
@@ -48,9 +48,9 @@ class Options:
     """Base class of options: in fields that hold paths, text becomes a path."""
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            if "Path" in str(entry.type) and isinstance(value := getattr(self, entry.name), str):
-                object.__setattr__(self, entry.name, Path(value))
+        for name, hint in get_type_hints(type(self)).items():
+            if Path in (hint, *get_args(hint)) and isinstance(value := getattr(self, name), str):
+                object.__setattr__(self, name, Path(value))
 
 
 # -- shared by several commands ----------------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ class TrainOptions(Training, Effort, Resources, HowItRuns):
 class PosesOptions(PoseEstimation):
     """Options of structure from motion."""
 
-    photos: PhotosPath
+    photos: Photos
     """Folder of photographs, or a video. It is only read."""
     out: Annotated[Path, Arg(metavar="CAPTURE")]
     """Capture folder to create: images/, sparse/0, poses.json, poses.png."""
@@ -217,7 +217,7 @@ class PosesOptions(PoseEstimation):
 class ReconstructOptions(Effort, Resources, HowItRuns):
     """Options of a reconstruction, from photographs to a mesh."""
 
-    photos: PhotosPath
+    photos: Photos
     """Folder of photographs, or a video. It is only read."""
     out: Annotated[Path, Arg(metavar="RUN")]
     """Run folder to create. Photographs and cameras go to its sub-folder `capture`."""

@@ -29,7 +29,7 @@ function showStatus(text) {
 }
 
 async function requestSplats() {
-  const answer = await request("splats");
+  const answer = await request("splats", { stage: $("stage").value });
   const buffer = await answer.arrayBuffer();
   Object.assign(facts, JSON.parse(answer.headers.get("X-Splats")));
   load(buffer);
@@ -51,6 +51,11 @@ async function poll() {
 }
 
 async function connect() {
+  const stage = $("stage");
+  stage.replaceChildren(...offer.stages.map((name) => new Option(name)));
+  stage.selectedIndex = offer.stages.length - 1;
+  stage.hidden = offer.stages.length < 2;
+  stage.onchange = () => requestSplats().then(() => showStatus(""), (error) => showStatus(error.message));
   $("live").hidden = !offer.live;
   $("live").onclick = () => press("live", !isPressed("live"));
   if (offer.live) poll();
