@@ -18,7 +18,7 @@ from gs2d.io.run_dir import LEARNED, RunFolder
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
-from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.prepare.run_appearance import exposure_gain
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, ignore
@@ -71,6 +71,16 @@ def test_training_views_are_scored_in_their_exposures(run: RunFolder) -> None:
         )
         assert last[split]["psnr"] == pytest.approx(own)
         assert (plain == own) == (split == "test")
+
+
+def test_matched_scores_are_added_on_request(run: RunFolder) -> None:
+    plain = run.metrics()["stages"][-1]
+    assert "test_matched" not in plain
+    matched = evaluate_run(run.path, EvaluateOptions(match="exposure"))
+    assert matched["test"]["psnr"] == plain["test"]["psnr"]
+    assert matched["test_matched"]["psnr"] != plain["test"]["psnr"]
+    assert run.metrics()["stages"][-1]["test_matched"] == matched["test_matched"]
+    assert "new views, colours matched to the photograph" in run.file("report.html").read_text()
 
 
 def test_a_missing_or_damaged_file_of_exposures_is_an_error_with_a_remedy(run: RunFolder, tmp_path: Path) -> None:

@@ -8,18 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ball_runs import SMALL, Stop, comparable, options
+from gs2d.core.transforms import perturb_pose
 from gs2d.data import load_scene
 from gs2d.errors import RunError
 from gs2d.evaluation.image_metrics import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.finish.run_images import render_run
+from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
-from gs2d.pipeline.prepare.options import RenderOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.run_poses import aligned, camera_motion
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, Step, ignore
 
@@ -79,6 +82,28 @@ def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, t
     texture = _views(job, TextureOptions(texture_downscale=2), ignore)
     assert np.array_equal(texture[0].camera.T_cam_world, job.scene.train[0].camera.T_cam_world)
     assert texture[0].camera.width == job.scene.train[0].camera.width // 2
+
+
+def test_aligned_scores_are_added_on_request(run: RunFolder) -> None:
+    plain = run.metrics()["stages"][-1]
+    assert "test_aligned" not in plain
+    both = evaluate_run(run.path, EvaluateOptions(match="poses"))
+    assert both["test"]["psnr"] == plain["test"]["psnr"]
+    assert both["test_aligned"]["psnr"] > plain["test"]["psnr"]
+    assert run.metrics()["stages"][-1]["test_aligned"] == both["test_aligned"]
+    assert "new views, cameras aligned with the photograph" in run.file("report.html").read_text()
+
+
+def test_a_view_is_aligned_to_its_photograph(run: RunFolder) -> None:
+    _, job, splats = open_finished(run.path, 1, ignore)
+    view, drawing = job.scene.train[0], (job.settings, job.backend)
+    color = render_view(splats, view, *drawing).color.clamp(0, 1).numpy()
+    image = type(view).from_arrays("a", view.camera, np.rint(255 * color).astype(np.uint8))
+    off = perturb_pose(view.camera, torch.tensor([0.01, -0.01, 0, 0.01, 0.02, 0], dtype=torch.float64))
+    (found,) = aligned(splats, [image.at(off.T_cam_world)], *drawing, job.scene.extent, ignore)
+    middle = np.zeros(3)
+    before, after = (camera_motion(view.camera, c, middle, job.scene.extent)["pixels"] for c in (off, found.camera))
+    assert after < 0.3 * before
 
 
 def test_an_interrupted_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capture: Path, tmp_path: Path) -> None:

@@ -127,6 +127,10 @@ def evaluate(command: c.EvaluateCommand, console: Console) -> None:
     _keep_to(command.memory)
     result = evaluate_run(command.run, command, console.on_event, threads=command.threads)
     rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]
+    if "exposure" in command.matched:
+        rows += score_rows("test, matched", result["test_matched"])
+    if "poses" in command.matched:
+        rows += score_rows("test, aligned", result["test_aligned"])
     console.table("", ["views", "images", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
     for split in ("train", "test"):
         reason = (result.get(split) or {}).get("lpips_reason") or result.get(f"{split}_reason")

@@ -99,11 +99,11 @@ def _rendered(
         yield RenderedPhotograph(view, split, output, image, target, mask)
 
 
-def split_metrics(scores: dict[str, ImageMetrics], split: str) -> dict[str, Any]:
-    """Return ``{split: means}``, or null with the reason if the scene has no such views."""
+def split_metrics(scores: dict[str, ImageMetrics], name: str, split: str | None = None) -> dict[str, Any]:
+    """Return ``{name: means}``, or null with the reason if the scene has no views of ``split`` (default: ``name``)."""
     if not scores:
-        return {split: None, f"{split}_reason": f"the scene has no {split} views"}
-    return {split: mean_metrics(list(scores.values())).to_json()}
+        return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
+    return {name: mean_metrics(list(scores.values())).to_json()}
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:

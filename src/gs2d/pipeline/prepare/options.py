@@ -17,6 +17,7 @@ from gs2d.config.quantities import QUANTITIES
 from gs2d.config.recipe import Recipe
 from gs2d.errors import RecipeError
 
+MATCHED = ("exposure", "poses")  # of EvaluateOptions
 Robust = Literal["auto", "on", "off"]
 Quality = Literal["auto", "draft", "normal", "full"]
 LensModel = Literal[
@@ -316,3 +317,13 @@ class EvaluateOptions(Options):
     """Thresholds for precision and recall, world units (default: 0.25, 0.5 and 1 % of the size of the true surface)."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights; without them LPIPS is not computed."""
+    match: Annotated[str | tuple[str, ...], Arg(metavar="NAMES")] = ()
+    """Also score test views after matching exposure, poses, or exposure,poses to the photographs."""
+
+    @property
+    def matched(self) -> tuple[str, ...]:
+        """Return the names in ``match``, checked."""
+        names = tuple(self.match.split(",")) if isinstance(self.match, str) else self.match
+        if set(names) - set(MATCHED):
+            raise RecipeError(f"--match must name {' or '.join(MATCHED)}, got {','.join(names)}")
+        return names

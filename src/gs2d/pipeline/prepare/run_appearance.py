@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,6 +14,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import LEARNED, SPLATS, RunFolder
+from gs2d.render.exposure_transform import expose, fit_exposure
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.appearance import numbers_of, shown, unshown
 from gs2d.training.learned.image_exposure import exposure_gain
@@ -87,6 +90,34 @@ def as_scene(view: View) -> np.ndarray:
     back, result = unshown(color, numbers_of(view, color), ImagePoints(view.camera)), image.copy()
     result[..., :3] = np.rint(255 * np.clip(back.numpy(), 0, 1))
     return result
+
+
+def matched_by_halves(
+    view: View, color: Tensor, target: Tensor, mask: Tensor | None, background: tuple[float, float, float]
+) -> Tensor:
+    """Return a rendering with its colours matched to the photograph.
+
+    Each half gets the transform that fits the other half best (least squares), so that no pixel is matched to itself.
+
+    Parameters
+    ----------
+    view : View
+    color, target : Tensor [H, W, 3]
+        Rendering and photograph, over the background.
+    mask : Tensor [H, W] bool or None
+        False = ignore this pixel.
+    background : three floats
+    """
+    camera = replace(view, appearance={k: found for k, found in view.appearance.items() if k != "exposure"})
+    color, cover = photographed(camera, color, background), over(view, color, background)
+    usable = torch.ones_like(color[..., 0], dtype=torch.bool) if mask is None else mask.clone()
+    if cover:
+        usable &= cover[0] > 0
+    left = torch.zeros_like(usable)
+    left[:, : color.shape[1] // 2] = True
+    to_right = expose(color, fit_exposure(color, target, usable & left, *cover), *cover)
+    to_left = expose(color, fit_exposure(color, target, usable & ~left, *cover), *cover)
+    return torch.where(left[..., None], to_left, to_right)
 
 
 def over(view: View, color: Tensor, background: tuple[float, float, float]) -> tuple[Tensor, ...]:

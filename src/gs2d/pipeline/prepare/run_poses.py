@@ -1,21 +1,27 @@
-"""Refined cameras of a run: its file ``poses.json``."""
+"""Refined cameras of a run: its file ``poses.json``, and the alignment of test cameras to their photographs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from gs2d.config.recipe import Recipe
+from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.core.camera import Camera, Zoom
 from gs2d.core.json_files import read_json, write_json
-from gs2d.core.transforms import focus_point
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import focus_point, perturb_pose
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import POSES, SPLATS, RunFolder
-from gs2d.training.events import Notice, OnEvent
+from gs2d.losses.base import LossView, compute_losses
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.training.events import Notice, OnEvent, counted
 
 ABOUT = (
     "refined cameras of the training photographs and original cameras of the test photographs, in the layout of "
@@ -25,6 +31,9 @@ ABOUT = (
 )
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GRID = 5  # points along each side of an image, by which motion is measured
+STEPS = 80  # of Adam, to align a test view
+RATE, RATE_FINAL = 2e-3, 2e-5  # rad and extents
+PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
 
 
 def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent) -> None:
@@ -120,3 +129,36 @@ def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
         if view.name not in poses or (recipe.learns("intrinsics") and view.name not in zooms):
             raise RunError(f"{run.file(POSES)} lacks pose or zoom of {view.name}; {remedy}")
     return refined
+
+
+def aligned(
+    splats: Splats,
+    views: Sequence[View],
+    settings: RasterSettings,
+    backend: Backend,
+    extent: float,
+    on_event: OnEvent,
+) -> Iterator[View]:
+    """Yield views with their cameras aligned to their photographs, by the photometric loss of the fixed splats.
+
+    Scores of aligned views measure the scene apart from errors of its test cameras.
+    """
+    for view in counted(views, "aligning cameras of test views", len(views), on_event):
+        target = torch.from_numpy(view.target(settings.background)).to(splats.means)
+        pixels = view.mask()
+        mask = None if pixels is None else torch.from_numpy(pixels).to(splats.device)
+        unit = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
+        motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        optimizer = torch.optim.Adam([motion], lr=RATE)
+        decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATE_FINAL / RATE) ** (1 / STEPS))
+        for _ in range(STEPS):
+            camera = perturb_pose(view.camera, motion * unit)
+            output = rasterize(splats, camera, settings, backend=backend)
+            compared = LossView(target, camera, mask)
+            loss = sum(compute_losses(output, compared, PHOTOMETRIC, backend=backend).values())
+            optimizer.zero_grad()
+            if isinstance(loss, torch.Tensor) and loss.requires_grad:
+                loss.backward()
+            optimizer.step()
+            decay.step()
+        yield view.at(perturb_pose(view.camera, motion.detach() * unit).T_cam_world)

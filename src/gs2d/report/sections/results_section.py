@@ -13,7 +13,12 @@ from gs2d.report.html_parts import macro, missing
 from gs2d.report.run_record import RunRecord, number
 from gs2d.report.sections.section_registry import register_section
 
-_SPLITS = {"test": "new views", "train": "training views"}
+_SPLITS = {
+    "test": "new views",
+    "test_matched": "new views, colours matched to the photograph",
+    "test_aligned": "new views, cameras aligned with the photograph",
+    "train": "training views",
+}
 _METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 _COSTS: tuple[tuple[str, int, Callable[[Mapping[str, Any]], float | None]], ...] = (
     ("Iterations", 0, lambda stage: number(stage.get("iterations"))),
