@@ -15,7 +15,7 @@ from gs2d.config.grades import GOOD, USABLE
 from gs2d.core.json_files import write_json
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.finish.run_verdict import Finding, Measures, ViewMeasures, judge, spread_pixels
+from gs2d.pipeline.finish.run_verdict import Finding, Measures, SurfaceSample, ViewMeasures, judge
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.report.run_record import RunRecord
@@ -108,11 +108,18 @@ def test_a_surface_that_is_unclear_in_many_pixels_is_reported_and_never_poor() -
     """A veil at alpha 0.3 before a wall: the image is right, but the two depths differ."""
     wall, veil = splat((0, 0, 4), scales=(4, 4), opacity=0.99), splat((0, 0, 2), scales=(4, 4), opacity=0.3)
     settings = RasterSettings().for_depths("transmittance")
-    spreads = [
-        spread_pixels(rasterize(scene, front_camera(), settings, backend="cpu")) for scene in (wall, stack(wall, veil))
-    ]
-    assert spreads == [0.0, 1.0]
-    assert spread_pixels(rasterize(wall, front_camera(), backend="cpu")) is None
+    camera = front_camera()
+    clear, veiled = (
+        SurfaceSample.of(camera, rasterize(scene, camera, settings, backend="cpu"))
+        for scene in (wall, stack(wall, veil))
+    )
+    assert (clear.share(None), veiled.share(None)) == (0.0, 1.0)
+    around = camera.center + np.array([[-1, -1, 3], [1, 1, 5]]) @ camera.rotation
+    around = np.stack([around.min(axis=0), around.max(axis=0)])
+    assert veiled.share(around) == 1.0  # the veil is before the box
+    before = camera.center + np.array([[-1, -1, 0.5], [1, 1, 1]]) @ camera.rotation
+    before = np.stack([before.min(axis=0), before.max(axis=0)])
+    assert veiled.share(before) is None  # the wall is behind the box
     for spread, grade in ((0.14, GOOD), (0.3, USABLE), (1.0, USABLE)):
         verdict = judge(Measures(tuple(replace(view, spread=spread) for view in views())))
         assert verdict.grade == grade

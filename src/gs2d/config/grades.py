@@ -30,7 +30,7 @@ NEW_VIEWS = Limits(25.0, 20.0)  # dB: differences are hard to find from 25 dB; p
 TRAINING_VIEWS = Limits(27.0, 22.0)  # dB: training views are about 2 dB better than new ones in dense captures
 FLOATERS = Limits(0.02, 0.3)  # of the sparse points: clean scenes hide up to 0.5 %, visible fog 5 to 20 %
 BEHIND = Limits(0.15, 0.3)  # if every new view is good: a reflecting table has 10 % of its points behind it
-# Share of opaque pixels whose surface is unclear, mean over views: 0 to 14 % where the mesh is whole,
+# Share of opaque pixels of the subject whose surface is unclear, mean over views: 0 to 14 % where the mesh is whole,
 # 19 to 41 % in views of one that a veil tore. Images can still be good, so it never makes a run poor.
 SPREAD = Limits(0.2, 1.0)
 OVERFIT = 3.0  # dB that training views exceed new views by, from which longer training does not help

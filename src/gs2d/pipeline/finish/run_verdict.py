@@ -12,14 +12,19 @@ from dataclasses import asdict, dataclass, replace
 from statistics import fmean
 from typing import Any
 
+import numpy as np
+
 from gs2d.config import grades
 from gs2d.config.grades import GOOD, POOR, USABLE
+from gs2d.core.camera import Camera
 from gs2d.core.json_files import write_json
 from gs2d.data import Scene
+from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import RunError
 from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import VERDICT, RunFolder
+from gs2d.meshing.fusion_bounds import backproject
 from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.open_capture import placed_photographs
@@ -38,6 +43,7 @@ UNCHECKED = "The training photographs are reproduced {}; new views were not chec
 NOT_MEASURED = "not measured"
 OPAQUE = 0.5  # alpha; above, a pixel shows a surface
 CLEAR = 0.9  # alpha; below, more than a tenth of the colour is background
+SURFACE_PIXELS = 2000  # of a view, at which its surface is examined
 SPREAD_DEPTH = 0.05  # of the mean depth; the depth that hides a sparse point (evaluation/hidden_points.py)
 
 
@@ -54,7 +60,7 @@ class ViewMeasures:
     points, hidden : int or None
         Sparse points visible in a test view, and how many of them its rendering hides.
     spread : float or None
-        Share of the opaque pixels along which the splats lie at different depths (:func:`spread_pixels`).
+        Share of the opaque pixels of the subject whose surface is unclear (:class:`SurfaceSample`).
     transparent : float or None
         Share of the pixels in which the background shows through, of a training view without alpha channel.
     """
@@ -98,17 +104,18 @@ class Collector:
 
     def __init__(self, scene: Scene) -> None:
         self._views: dict[str, ViewMeasures] = {}
+        self._surfaces: dict[str, SurfaceSample] = {}
         self.failure: Exception | None = None
         self._observed = scene.observed(guessed=False)  # None: floaters cannot be counted
 
-    @property
-    def views(self) -> tuple[ViewMeasures, ...]:
-        """Return the views measured so far."""
-        return tuple(self._views.values())
+    def views(self, box: np.ndarray | None = None) -> tuple[ViewMeasures, ...]:
+        """Return the views measured so far; surfaces are judged in a box [2, 3], world units, or everywhere."""
+        spread = {name: surface.share(box) for name, surface in self._surfaces.items()}
+        return tuple(replace(view, spread=spread.get(name)) for name, view in self._views.items())
 
     def transparent(self) -> dict[str, Any]:
         """Return ``{"transparent": ...}`` for ``metrics.json``: the mean share, the worst view and its share."""
-        shares = {view.name: view.transparent for view in self.views if view.transparent is not None}
+        shares = {view.name: view.transparent for view in self._views.values() if view.transparent is not None}
         if not shares:
             return {}
         worst = max(shares, key=shares.__getitem__)
@@ -126,7 +133,9 @@ class Collector:
     def _measure(self, seen: RenderedPhotograph, scores: ImageMetrics) -> ViewMeasures:
         view, psnr = seen.view, scores.psnr.value
         psnr = psnr if psnr is not None and math.isfinite(psnr) else None
-        measured = ViewMeasures(view.name, seen.split, psnr, spread=spread_pixels(seen.output))
+        measured = ViewMeasures(view.name, seen.split, psnr)
+        if seen.output.depth_transmittance is not None:
+            self._surfaces[view.name] = SurfaceSample.of(view.camera, seen.output)
         if seen.split == "train" and view.alpha() is None:
             alpha = seen.output.alpha if seen.mask is None else seen.output.alpha[seen.mask]
             return replace(measured, transparent=float((alpha < CLEAR).double().mean()) if alpha.numel() else None)
@@ -137,17 +146,48 @@ class Collector:
         return replace(measured, points=len(points.depth), hidden=hidden)
 
 
-def spread_pixels(output: RenderOutput) -> float | None:
-    """Return the share of opaque pixels whose surface is unclear; None without the transmittance depth.
+@dataclass(frozen=True, eq=False)
+class SurfaceSample:
+    """Some opaque pixels of a view, and whether their surface is unclear.
 
     There the depths of half transmittance and of the mean differ by more than ``SPREAD_DEPTH``: part of the splats is
     not on the surface, as in a faint veil in front of it. The image can be right, but the mesh tears.
+
+    Attributes
+    ----------
+    center : ndarray [3] world units
+    rays : ndarray [n, 3] float32
+        From the camera centre, with a depth of 1.
+    depth : ndarray [n] world units
+        Of half transmittance.
+    unclear : ndarray [n] bool
     """
-    if output.depth_transmittance is None:
-        return None
-    opaque = output.alpha > OPAQUE
-    mean, half = output.depth_mean[opaque], output.depth_transmittance[opaque]
-    return float(((half - mean).abs() > SPREAD_DEPTH * mean).double().mean()) if len(mean) else None
+
+    center: np.ndarray
+    rays: np.ndarray
+    depth: np.ndarray
+    unclear: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, output: RenderOutput) -> SurfaceSample:
+        """Sample a rendering with the transmittance depth."""
+        mean, half = output.depth_mean.cpu().numpy(), output.depth("transmittance").cpu().numpy()
+        rows, columns = np.nonzero(output.alpha.cpu().numpy() > OPAQUE)
+        some = slice(None, None, max(1, len(rows) // SURFACE_PIXELS))
+        rows, columns = rows[some], columns[some]
+        mean, half = mean[rows, columns], half[rows, columns]
+        rays = backproject(camera, np.ones(len(rows)), rows, columns) - camera.center
+        return cls(camera.center, rays.astype(np.float32), half, np.abs(half - mean) > SPREAD_DEPTH * mean)
+
+    def share(self, box: np.ndarray | None) -> float | None:
+        """Return the share of unclear pixels, of those that see into the box [2, 3] and not past it; None of none."""
+        unclear = self.unclear
+        if box is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ends = (box[:, None] - self.center) / self.rays  # [2, n, 3], in units of depth
+            enter, leave = np.nanmax(ends.min(axis=0), axis=1), np.nanmin(ends.max(axis=0), axis=1)
+            unclear = unclear[(leave > np.maximum(enter, 0)) & (self.depth <= leave)]
+        return float(unclear.mean()) if len(unclear) else None
 
 
 # -- judging -----------------------------------------------------------------------------------------------------------
@@ -279,11 +319,13 @@ def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> di
     """
     if collected.failure is not None:
         raise collected.failure
-    if not collected.views:
+    subject = read_subject(run.path) if loaded.protocol.fusion.subject else None
+    views = collected.views(subject.box if subject is not None and subject.kind == OBJECT else None)
+    if not views:
         if not run.file(VERDICT).exists():
             raise RunError("the run was interrupted between scoring and measuring; `gs2d evaluate RUN` measures it")
         return read_verdict(run.path)
-    measures = Measures(collected.views, *placed_photographs(loaded.scene.root))
+    measures = Measures(views, *placed_photographs(loaded.scene.root))
     verdict = asdict(judge(measures))
     write_json(run.file(VERDICT), {"format": FORMAT, "verdict": verdict, "measured": asdict(measures)})
     return verdict
