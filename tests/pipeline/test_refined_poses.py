@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,11 +95,13 @@ def test_aligned_scores_are_added_on_request(run: RunFolder) -> None:
     assert "new views, cameras aligned with the photograph" in run.file("report.html").read_text()
 
 
-def test_a_view_is_aligned_to_its_photograph(run: RunFolder) -> None:
+@pytest.mark.parametrize("gain", [1.0, 0.3])
+def test_a_view_is_aligned_to_its_photograph_in_its_exposure(run: RunFolder, gain: float) -> None:
     _, job, splats = open_finished(run.path, 1, ignore)
     view, drawing = job.scene.train[0], (job.settings, job.backend)
     color = render_view(splats, view, *drawing).color.clamp(0, 1).numpy()
-    image = type(view).from_arrays("a", view.camera, np.rint(255 * color).astype(np.uint8))
+    image = type(view).from_arrays("a", view.camera, np.rint(255 * gain * color).astype(np.uint8))
+    image = replace(image, appearance={"exposure": gain * np.eye(3, 4)})
     off = perturb_pose(view.camera, torch.tensor([0.01, -0.01, 0, 0.01, 0.02, 0], dtype=torch.float64))
     (found,) = aligned(splats, [image.at(off.T_cam_world)], *drawing, job.scene.extent, ignore)
     middle = np.zeros(3)

@@ -66,7 +66,7 @@ def evaluate_run(
     if "exposure" in wanted:
         result |= split_metrics(matched, "test_matched", "test")
     if "poses" in wanted:
-        best = tuple(aligned(splats, loaded.scene.test, *drawing, loaded.scene.extent, on_event))
+        best = tuple(aligned(splats, scene.test, *drawing, loaded.scene.extent, on_event))
         result |= split_metrics(score_views(splats, best, *drawing, on_event, lpips=lpips), "test_aligned", "test")
     if truth is not None and has_mesh:
         mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds

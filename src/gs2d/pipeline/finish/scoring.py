@@ -69,7 +69,7 @@ def score_views(
     """
     rendered = _rendered(splats, views, settings, backend, split)
     scores: dict[str, ImageMetrics] = {}
-    for seen in counted(rendered, f"scoring {split} views", len(views), on_event):
+    for seen in counted(rendered, f"scoring {split} views" if split else "scoring", len(views), on_event):
         metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=lpips)
         scores[seen.view.name] = metrics
         for visit in visitors:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import POSES, SPLATS, RunFolder
 from gs2d.losses.base import LossView, compute_losses
+from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
@@ -141,7 +143,8 @@ def aligned(
 ) -> Iterator[View]:
     """Yield views with their cameras aligned to their photographs, by the photometric loss of the fixed splats.
 
-    Scores of aligned views measure the scene apart from errors of its test cameras.
+    Renderings have the appearance of the photographs, as far as it is known. Scores of aligned views measure the scene
+    apart from errors of its test cameras.
     """
     for view in counted(views, "aligning cameras of test views", len(views), on_event):
         target = torch.from_numpy(view.target(settings.background)).to(splats.means)
@@ -154,6 +157,7 @@ def aligned(
         for _ in range(STEPS):
             camera = perturb_pose(view.camera, motion * unit)
             output = rasterize(splats, camera, settings, backend=backend)
+            output = replace(output, color=photographed(view, output.color, settings.background))
             compared = LossView(target, camera, mask)
             loss = sum(compute_losses(output, compared, PHOTOMETRIC, backend=backend).values())
             optimizer.zero_grad()
