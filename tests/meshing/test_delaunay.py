@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.spatial import Delaunay
 
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
 from gs2d.kernels.library import load
+from gs2d.kernels.native_tetrahedra import minimum_cut_on_cpu
 from gs2d.meshing.delaunay import extract_delaunay
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.evidence import areas
 from gs2d.meshing.extract import ExtractOptions
-from gs2d.meshing.minimum_cut import minimum_cut
-from gs2d.meshing.tetrahedra import CUBE, Tetrahedra, divide
-from gs2d.meshing.visibility_votes import Lines, cast_votes
+from gs2d.meshing.tetrahedra import CUBE, FACES, Tetrahedra, divide
+from gs2d.meshing.visibility_votes import UNIT, Lines, cast_votes
 from surface_shapes import orbit, rays, sphere_depth
 
 BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])
@@ -48,10 +50,11 @@ def volumes(space: Tetrahedra) -> np.ndarray:
 
 
 # -- tetrahedra --------------------------------------------------------------------------------------------------------
-def test_native_tetrahedra_are_those_of_qhull() -> None:
+def test_tetrahedra_are_those_of_qhull() -> None:
     points = np.random.default_rng(1).normal(size=(300, 3))
-    spaces = [divide(points, np.zeros((0, 3)), library) for library in (load(), None)]
-    ours, theirs = ({tuple(sorted(row)) for row in space.corners.tolist()} for space in spaces)
+    space = divide(points, np.zeros((0, 3)), load())
+    both = (space.corners, Delaunay(space.xyz).simplices)
+    ours, theirs = ({tuple(sorted(row)) for row in corners.tolist()} for corners in both)
     corner = len(points)  # near the corners of the cube, four of which lie on a sphere, either is right
     assert {row for row in ours if row[-1] < corner} == {row for row in theirs if row[-1] < corner}
     assert len([row for row in ours if row[-1] < corner]) > 1000
@@ -79,38 +82,67 @@ def test_degenerate_points_fill_the_cube_without_overlap(kind: str) -> None:
 
 
 # -- votes and cut -----------------------------------------------------------------------------------------------------
-def test_native_votes_are_those_of_numpy() -> None:
+def spans(space: Tetrahedra, start: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where a ray enters and leaves each tetrahedron [T], and the facet it leaves through; inf if it misses."""
+    rates, heights = np.empty((2, *space.corners.shape))
+    for k in range(4):
+        p, q, r = (space.xyz[space.corners[:, i]] for i in FACES[k])
+        normal = np.cross(q - p, r - p)  # inwards
+        rates[:, k], heights[:, k] = normal @ direction, (normal * (start - p)).sum(axis=1)
+    distance = -heights / rates
+    enters = np.maximum(np.where(rates > 0, distance, 0).max(axis=1), 0)
+    leaving = np.where(rates < 0, distance, np.inf)
+    leaves, facet = leaving.min(axis=1), leaving.argmin(axis=1)
+    met = leaves > enters + 1e-9
+    return np.where(met, enters, np.inf), np.where(met, leaves, np.inf), facet
+
+
+def test_votes_are_those_of_every_line_with_every_tetrahedron() -> None:
     rng = np.random.default_rng(2)
     points = rng.normal(size=(200, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     space = divide(points, np.full((1, 3), 3.0), load())
-    ends = np.arange(200, dtype=np.int32)
-    lines = Lines(ends, 3.0 * points, np.full(200, 0.1), rng.uniform(0.5, 2, 200), 150)
-    ours, theirs = cast_votes(space, lines, load()), cast_votes(space, lines, None)
-    np.testing.assert_array_equal(ours.facets, theirs.facets)
-    np.testing.assert_array_equal(ours.full, theirs.full)
-    np.testing.assert_array_equal(ours.cameras, theirs.cameras)
-    assert (ours.full > 0).sum() > 50
-    assert ours.facets.sum() > 0
+    ends, weights, sigma, surfaces = np.arange(200, dtype=np.int32), rng.uniform(0.5, 2, 200), 0.1, 150
+    votes = cast_votes(space, Lines(ends, 3.0 * points, np.full(200, sigma), weights, surfaces), load())
+    facets, full, cameras = (np.zeros_like(votes[name]) for name in ("facets", "full", "cameras"))
+    for line, weight in enumerate(np.rint(UNIT * weights)):
+        start, away = space.xyz[line], 3.0 * points[line] - space.xyz[line]
+        length = np.linalg.norm(away)
+        enters, leaves, facet = spans(space, start, away / length)
+        crossed = np.flatnonzero(leaves < length)
+        across = space.neighbours[crossed, facet[crossed]], space.mirror[crossed, facet[crossed]]
+        facets[across] += np.floor(weight * (1 - np.exp(-0.5 * (leaves[crossed] / sigma) ** 2)) + 0.5).astype(np.int32)
+        cameras[(enters < length) & (leaves >= length)] = 1
+        if line < surfaces:
+            enters, leaves, _ = spans(space, start, -away / length)
+            full[(enters < sigma) & (leaves >= sigma)] += int(weight)
+    np.testing.assert_array_equal(votes["facets"], facets)
+    np.testing.assert_array_equal(votes["full"], full)
+    np.testing.assert_array_equal(votes["cameras"], cameras)
+    assert (full > 0).sum() > 50
+    assert facets.sum() > 0
 
 
-def test_the_native_cut_has_the_cost_of_scipys_maximum_flow() -> None:
+def test_the_cut_has_the_cost_of_scipys_maximum_flow_and_the_smallest_source_side() -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        found = Delaunay(rng.normal(size=(rng.integers(6, 120), 3)))
-        neighbours = found.neighbors.astype(np.int32)
+        neighbours = Delaunay(rng.normal(size=(rng.integers(6, 120), 3))).neighbors.astype(np.int32)
+        count = len(neighbours)
         node, arc = np.nonzero(neighbours >= 0)
         mirror = np.zeros(neighbours.shape, np.uint8)
         mirror[node, arc] = (neighbours[neighbours[node, arc]] == node[:, None]).argmax(axis=1)
         capacity = (rng.integers(0, 20, neighbours.shape) * (rng.random(neighbours.shape) < 0.8)).astype(np.int32)
         capacity[neighbours < 0] = 0
-        terminal = (rng.integers(-60, 60, len(neighbours)) * (rng.random(len(neighbours)) < 0.4)).astype(np.int32)
-        side, flow = minimum_cut(neighbours, mirror, capacity, terminal, load())
-        same, reference = minimum_cut(neighbours, mirror, capacity, terminal, None)
-        across = side[node] & ~side[neighbours[node, arc]]
-        cost = capacity[node, arc][across].sum() + terminal[~side & (terminal > 0)].sum()
-        assert flow == reference == cost - terminal[side & (terminal < 0)].sum()
-        np.testing.assert_array_equal(side, same)
+        terminal = (rng.integers(-60, 60, count) * (rng.random(count) < 0.4)).astype(np.int32)
+        graph = np.zeros((count + 2, count + 2), np.int32)  # with source and sink
+        graph[node, neighbours[node, arc]] = capacity[node, arc]
+        graph[count, :count], graph[:count, count + 1] = np.maximum(terminal, 0), np.maximum(-terminal, 0)
+        side, flow = minimum_cut_on_cpu(load(), neighbours, mirror, capacity.copy(), terminal.copy())
+        expected = maximum_flow(csr_array(graph), count, count + 1)
+        left = csr_array(graph - expected.flow.toarray())
+        reached = breadth_first_order(left, count, return_predecessors=False)
+        assert flow == expected.flow_value
+        np.testing.assert_array_equal(np.flatnonzero(side), np.sort(reached[reached < count]))
 
 
 # -- surfaces ----------------------------------------------------------------------------------------------------------

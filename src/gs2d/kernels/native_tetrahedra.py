@@ -1,8 +1,4 @@
-"""Native Delaunay tetrahedra, votes of lines of sight, and minimum cut.
-
-``meshing/tetrahedra.py``, ``meshing/visibility_votes.py`` and ``meshing/minimum_cut.py`` have the same in numpy and
-SciPy.
-"""
+"""Native Delaunay tetrahedra, votes of lines of sight, and minimum cut."""
 
 from __future__ import annotations
 

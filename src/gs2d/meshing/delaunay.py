@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
-from gs2d.kernels.library import Library, optional_library
+from gs2d.kernels.library import Library, ready_library
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import clean
@@ -84,7 +84,7 @@ def extract_delaunay(
         As for ``extract``.
     """
     backend = fusion_backend(backend)
-    library = optional_library()
+    library = ready_library()
     with Spool.of(frames) as spool:
         if len(spool) < 2:
             raise ProtocolError(f"a mesh by Delaunay needs two or more views, got {len(spool)}; use --method tsdf")
@@ -135,9 +135,7 @@ def _points(fused: Mesh, spool: Spool, limits: FusionBounds, options: ExtractOpt
     return points
 
 
-def _sight(
-    points: OrientedPoints, spool: Spool, limits: FusionBounds, library: Library | None
-) -> tuple[Tetrahedra, Lines]:
+def _sight(points: OrientedPoints, spool: Spool, limits: FusionBounds, library: Library) -> tuple[Tetrahedra, Lines]:
     """Return tetrahedra of the points and of points beyond the scene, and the lines of sight to both."""
     centers = np.array([camera.center for camera in spool.cameras])
     seen = sight_lines(points, spool, limits, most=LINES_A_POINT)

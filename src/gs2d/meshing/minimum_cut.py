@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from gs2d.kernels.library import Library
 from gs2d.kernels.native_tetrahedra import minimum_cut_on_cpu
 from gs2d.meshing.tetrahedra import FACES, Tetrahedra
-from gs2d.meshing.visibility_votes import UNIT, Votes
+from gs2d.meshing.visibility_votes import UNIT
 
 MOST = 1 << 28  # of a vote or a shape: two arcs with both and their flows fit into 32 bits
 QUALITY = 2.0  # cost of a facet between two flat tetrahedra, in lines; 1 to 5 give the same Chamfer distance
@@ -17,60 +17,17 @@ AREA = 0.05  # cost of the area of a point, in lines: closes what no view shows 
 ROWS_AT_ONCE = 1 << 17
 
 
-def minimum_cut(
-    neighbours: np.ndarray, mirror: np.ndarray, capacity: np.ndarray, terminal: np.ndarray, library: Library | None
-) -> tuple[np.ndarray, int]:
-    """Cut a graph whose nodes have at most four neighbours.
-
-    Parameters
-    ----------
-    neighbours : ndarray [N, 4] int32
-        -1 without a neighbour.
-    mirror : ndarray [N, 4] uint8
-        Index of the arc back.
-    capacity : ndarray [N, 4] int32
-        Of the arcs to the neighbours.
-    terminal : ndarray [N] int32
-        Capacity from the source, or minus that to the sink.
-    library : Library or None
-        The native library, or None for SciPy.
-
-    Returns
-    -------
-    source_side : ndarray [N] bool
-        Nodes on the side of the source; the smallest such set of minimum cost.
-    flow : int
-    """
-    if library is not None:
-        arrays = (np.ascontiguousarray(array, np.int32).copy() for array in (capacity, terminal))
-        return minimum_cut_on_cpu(library, neighbours, mirror, *arrays)
-    count = len(neighbours)
-    node, arc = np.nonzero((neighbours >= 0) & (capacity > 0))
-    given, taken = np.flatnonzero(terminal > 0), np.flatnonzero(terminal < 0)
-    tails = np.concatenate([node, np.full(len(given), count), taken])
-    heads = np.concatenate([neighbours[node, arc], given, np.full(len(taken), count + 1)])
-    values = np.concatenate([capacity[node, arc], terminal[given], -terminal[taken]]).astype(np.int32)
-    graph = coo_array((values, (tails, heads)), shape=(count + 2, count + 2)).tocsr()
-    found = maximum_flow(graph, count, count + 1)
-    left = graph - found.flow
-    left.data[left.data < 0] = 0
-    left.eliminate_zeros()
-    side = np.zeros(count + 2, bool)
-    side[breadth_first_order(left, count, return_predecessors=False)] = True
-    return side[:count], int(found.flow_value)
-
-
 def outside(
-    space: Tetrahedra, votes: Votes, library: Library | None, *, spacing: np.ndarray, closed: bool = False
+    space: Tetrahedra, votes: Mapping[str, np.ndarray], library: Library, *, spacing: np.ndarray, closed: bool = False
 ) -> np.ndarray:
     """Return which tetrahedra are outside, [T] bool.
 
     Parameters
     ----------
     space : Tetrahedra
-    votes : Votes
-    library : Library or None
-        As for ``minimum_cut``.
+    votes : mapping of str to ndarray
+        From ``cast_votes``.
+    library : Library
     spacing : ndarray [P], world units
         Distance from each point on the surface to the next; the other corners have the median.
     closed : bool
@@ -78,12 +35,13 @@ def outside(
     """
     cost = QUALITY / 2 * _badness(space) + AREA * _areas(space, spacing)
     shape = np.rint(np.minimum(UNIT * cost, MOST)).astype(np.int32)
-    capacity = np.where(space.neighbours >= 0, np.minimum(votes.facets, MOST) + shape, 0).astype(np.int32)
-    terminal = -np.minimum(votes.full, MOST)
-    terminal[votes.cameras > 0] = MOST
+    # of the arcs to the neighbours, and from the source or, if negative, to the sink
+    capacity = np.where(space.neighbours >= 0, np.minimum(votes["facets"], MOST) + shape, 0).astype(np.int32)
+    terminal = -np.minimum(votes["full"], MOST)
+    terminal[votes["cameras"] > 0] = MOST
     if closed:
         terminal[(space.corners >= len(space.xyz) - 8).any(axis=1)] = MOST
-    return minimum_cut(space.neighbours, space.mirror, capacity, terminal, library)[0]
+    return minimum_cut_on_cpu(library, space.neighbours, space.mirror, capacity, terminal)[0]
 
 
 def _areas(space: Tetrahedra, spacing: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import Delaunay
 
 from gs2d.kernels.library import Library
 from gs2d.kernels.native_tetrahedra import tetrahedra_on_cpu
@@ -64,8 +63,8 @@ def morton(cells: np.ndarray) -> np.ndarray:
     return np.asarray(spread(cells[:, 0]) | spread(cells[:, 1]) << np.uint64(1) | spread(cells[:, 2]) << np.uint64(2))
 
 
-def divide(points: np.ndarray, around: np.ndarray, library: Library | None) -> Tetrahedra:
-    """Return the Delaunay tetrahedra of points [P, 3], by the native library or by Qhull.
+def divide(points: np.ndarray, around: np.ndarray, library: Library) -> Tetrahedra:
+    """Return the Delaunay tetrahedra of points [P, 3].
 
     The cube also contains the places ``around`` [C, 3].
     """
@@ -76,10 +75,7 @@ def divide(points: np.ndarray, around: np.ndarray, library: Library | None) -> T
     cube = np.array([[CUBE * (i >> axis & 1) for axis in range(3)] for i in range(8)])
     grid = np.concatenate([cells + MARGIN, cube]).astype(np.int32)
     xyz = lower + (grid - MARGIN) * step
-    if library is None:
-        corners, neighbours = _by_qhull(grid)
-    else:
-        corners, neighbours = tetrahedra_on_cpu(library, grid, _order(cells))
+    corners, neighbours = tetrahedra_on_cpu(library, grid, _order(cells))
     order = np.argsort(corners.min(axis=1), kind="stable")  # neighbours in space are neighbours in memory
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
@@ -92,16 +88,6 @@ def _order(cells: np.ndarray) -> np.ndarray:
     """Order points for insertion: random rounds that double, along a curve in each (Amenta et al. 2003)."""
     rounds = np.minimum(np.random.default_rng(0).geometric(0.5, len(cells)), ROUNDS)
     return np.lexsort((morton(cells), -rounds)).astype(np.int32)
-
-
-def _by_qhull(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    found = Delaunay(grid.astype(np.float64))
-    corners, neighbours = found.simplices.astype(np.int32), found.neighbors.astype(np.int32)
-    a, b, c, d = (grid[corners[:, k]].astype(np.float64) for k in range(4))
-    turned = np.flatnonzero(((b - a) * np.cross(c - a, d - a)).sum(axis=1) < 0)
-    for array in (corners, neighbours):
-        array[turned] = array[turned][:, [0, 1, 3, 2]]
-    return corners, neighbours
 
 
 def _mirror(neighbours: np.ndarray) -> np.ndarray:
