@@ -191,47 +191,6 @@ def skipping(name: str, skipped: list[str]) -> Iterator[None]:
         skipped.append(f"{name}: {error}")
 
 
-def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np.ndarray:
-    """Return T_cam_world of a camera-to-world matrix [3 or 4, 4]; the rotation is orthonormalised.
-
-    With ``opengl`` the axes y and z change sign: OpenGL cameras look along -z with y up.
-
-    Raises
-    ------
-    UnusableViewError
-        If a number is not finite.
-    DataError
-        If it is not a matrix or not a rigid motion.
-    """
-    try:
-        M = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{where} must be a 4x4 matrix of numbers, got {str(matrix)[:60]}") from error
-    except OverflowError as error:
-        raise UnusableViewError(f"{where} must be finite, got a number out of range") from error
-    if M.shape not in ((4, 4), (3, 4)):
-        raise DataError(f"{where} must be a 4x4 matrix, got shape {list(M.shape)}")
-    if not np.isfinite(M).all():
-        raise UnusableViewError(f"{where} must be finite, got NaN or infinity")
-    R = M[:3, :3]
-    with np.errstate(all="ignore"):  # numbers that overflow fail the check
-        is_rotation = np.abs(R.T @ R - np.eye(3)).max() <= 1e-2 and np.linalg.det(R) > 0
-        length, volume = np.linalg.norm(R, axis=0).round(4).tolist(), float(np.linalg.det(R))
-    if not is_rotation:
-        raise DataError(
-            f"{where} must hold a rotation, got columns of length {length} and determinant {volume:.4g}; "
-            "remove scale or mirroring from it"
-        )
-    u, _, vt = np.linalg.svd(R)
-    R = u @ vt
-    if opengl:
-        R = R * (1.0, -1.0, -1.0)
-    T = np.eye(4)
-    T[:3, :3] = R.T
-    T[:3, 3] = -R.T @ M[:3, 3]
-    return T
-
-
 def fit_to_file(frame: PosedImage) -> PosedImage:
     """Return the frame with intrinsics for the actual size of its file.
 

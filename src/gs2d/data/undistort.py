@@ -14,22 +14,27 @@ import torch
 from gs2d.data.camera_models import Lens
 from gs2d.errors import DataError, UnusableViewError
 
-_NEWTON = 20  # maximum number of iterations
-
-_COLMAP_PINHOLE = {"SIMPLE_PINHOLE", "PINHOLE"}
-#: COLMAP model -> (kind, order of its distortion parameters)
-_COLMAP_LENSES = {
-    "SIMPLE_RADIAL": ("perspective", "n1"),
-    "RADIAL": ("perspective", "n1 n2"),
-    "OPENCV": ("perspective", "n1 n2 p1 p2"),
-    "FULL_OPENCV": ("perspective", "n1 n2 p1 p2 n3 d1 d2 d3"),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", "n1"),
-    "RADIAL_FISHEYE": ("fisheye", "n1 n2"),
-    "OPENCV_FISHEYE": ("fisheye", "n1 n2 n3 n4"),
-    "THIN_PRISM_FISHEYE": ("fisheye", "n1 n2 p1 p2 n3 n4 s1 s2"),
-    "SIMPLE_FISHEYE": ("fisheye", ""),
-    "FISHEYE": ("fisheye", ""),
-    "FOV": ("fov", "w"),
+#: COLMAP model, in the order of ids -> (number of parameters, kind, order of the distortion parameters);
+#: kind "": not supported here
+COLMAP_MODELS = {
+    "SIMPLE_PINHOLE": (3, "pinhole", ""),
+    "PINHOLE": (4, "pinhole", ""),
+    "SIMPLE_RADIAL": (4, "perspective", "n1"),
+    "RADIAL": (5, "perspective", "n1 n2"),
+    "OPENCV": (8, "perspective", "n1 n2 p1 p2"),
+    "OPENCV_FISHEYE": (8, "fisheye", "n1 n2 n3 n4"),
+    "FULL_OPENCV": (12, "perspective", "n1 n2 p1 p2 n3 d1 d2 d3"),
+    "FOV": (5, "fov", "w"),
+    "SIMPLE_RADIAL_FISHEYE": (4, "fisheye", "n1"),
+    "RADIAL_FISHEYE": (5, "fisheye", "n1 n2"),
+    "THIN_PRISM_FISHEYE": (12, "fisheye", "n1 n2 p1 p2 n3 n4 s1 s2"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, "", ""),
+    "SIMPLE_DIVISION": (4, "", ""),
+    "DIVISION": (5, "", ""),
+    "SIMPLE_FISHEYE": (3, "fisheye", ""),
+    "FISHEYE": (4, "fisheye", ""),
+    "EUCM": (6, "", ""),
+    "EQUIRECTANGULAR": (2, "", ""),  # readers make a panorama of it
 }
 
 
@@ -56,32 +61,6 @@ class Intrinsics:
         points, shown = self.lens.project(rays)
         return points * (self.fx, self.fy) + (self.cx, self.cy), shown
 
-    def ideal(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the points [P, 2] of the plane z = 1 at pixels [P, 2], by Newton's method.
-
-        Raises
-        ------
-        DataError
-            If the lens maps no ray to one of the pixels.
-        """
-        bent = (np.asarray(pixels, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
-        if self.lens is None:
-            return bent
-        lens, x, h = self.lens, bent.copy(), 1e-6
-        du, dv = np.array([h, 0.0]), np.array([0.0, h])
-        with np.errstate(all="ignore"):
-            for _ in range(_NEWTON):
-                across = (lens.distort(x + du) - lens.distort(x - du)) / (2 * h)
-                along = (lens.distort(x + dv) - lens.distort(x - dv)) / (2 * h)
-                left = lens.distort(x) - bent
-                x = x - np.linalg.solve(np.stack([across, along], axis=-1), left[..., None])[..., 0]
-            off = np.linalg.norm(lens.distort(x) - bent, axis=-1) * max(self.fx, self.fy)
-            shown = (off < 1e-3) & lens.project(np.append(x, np.ones((len(x), 1)), axis=1))[1]
-        if not shown.all():
-            u, v = np.asarray(pixels)[np.flatnonzero(~shown)[0]]
-            raise DataError(f"expected a pixel that the lens maps a ray to, got {u:g}, {v:g}")
-        return x
-
     def scaled(self, width: int, height: int) -> Intrinsics:
         """Return the intrinsics for another image size."""
         sx, sy = width / self.width, height / self.height
@@ -107,16 +86,15 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
     DataError
         If the model is not supported, or the parameters are invalid.
     """
-    if model not in _COLMAP_PINHOLE and model not in _COLMAP_LENSES:
-        valid = ", ".join(sorted(_COLMAP_PINHOLE | set(_COLMAP_LENSES)))
+    expected, kind, names = COLMAP_MODELS.get(model, (0, "", ""))
+    if not kind:
+        valid = ", ".join(sorted(name for name, (_, kind, _) in COLMAP_MODELS.items() if kind))
         raise DataError(
             f"{camera} has the model {model}, which is not supported (supported: {valid}); "
             "run `colmap image_undistorter` and load its output"
         )
-    single = model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE")
-    kind, names = _COLMAP_LENSES.get(model, ("", ""))
     words = names.split()
-    expected = (3 if single else 4) + len(words)
+    single = expected - len(words) == 3  # one focal length
     if len(params) != expected:
         raise DataError(f"{camera}: the model {model} must have {expected} parameters, got {len(params)}")
     fx, fy, cx, cy = (params[0], *params[:3]) if single else params[:4]
@@ -128,7 +106,7 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
     lens = None
     if kind == "fov":
         lens = Lens("fov", (value["w"],))
-    elif kind:
+    elif kind != "pinhole":
         lens = Lens(
             kind,
             radial=tuple(value[w] for w in sorted(words) if w[0] == "n"),

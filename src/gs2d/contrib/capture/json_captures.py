@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.contrib.capture.camera_files import FileReader, register_file_reader
+from gs2d.contrib.capture.camera_files import FileReader, pose_from_camera_to_world, register_file_reader
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
+from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import CAMERA_MODELS, Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import Files, in_any_case

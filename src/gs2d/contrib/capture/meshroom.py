@@ -21,6 +21,7 @@ from gs2d.contrib.capture.camera_files import (
     FileReader,
     entries,
     points_beside,
+    pose_from_camera_to_world,
     real,
     reals,
     register_file_reader,
@@ -28,7 +29,7 @@ from gs2d.contrib.capture.camera_files import (
     whole,
 )
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
+from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.file_names import files_ending, in_any_case
 from gs2d.data.readers.common import find_photographs, head

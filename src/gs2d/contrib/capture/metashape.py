@@ -24,8 +24,16 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gs2d.contrib.capture.camera_files import FileReader, points_beside, real, reals, register_file_reader, whole
-from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
+from gs2d.contrib.capture.camera_files import (
+    FileReader,
+    points_beside,
+    pose_from_camera_to_world,
+    real,
+    reals,
+    register_file_reader,
+    whole,
+)
+from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import files_ending, in_any_case

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gs2d.data import View
+from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 _STEPS = 10  # Gauss-Newton iterations
+_NEWTON = 20  # of Newton, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ def triangulate(views: Sequence[View], marks: np.ndarray, name: str) -> Triangul
     """
     if len(views) < 2:
         raise DataError(f"{name} must be marked in at least two photographs, got {len(views)}")
-    ideal = np.stack([view.file_intrinsics().ideal(mark[None])[0] for view, mark in zip(views, marks, strict=True)])
+    ideal = np.stack([_ideal(view.file_intrinsics(), mark) for view, mark in zip(views, marks, strict=True)])
     rotations = np.stack([view.camera.rotation for view in views])
     centers = np.stack([view.camera.center for view in views])
     rays = np.einsum("vji,vj->vi", rotations, np.column_stack([ideal, np.ones(len(views))]))
@@ -59,6 +61,30 @@ def triangulate(views: Sequence[View], marks: np.ndarray, name: str) -> Triangul
         [view.file_intrinsics().project(p[None, :2] / p[2])[0] for view, p in zip(views, local, strict=True)]
     )
     return Triangulated(point, np.linalg.norm(seen - marks, axis=1))
+
+
+def _ideal(k: Intrinsics, pixel: np.ndarray) -> np.ndarray:
+    """Return the point [2] of the plane z = 1 at a pixel [2], by Newton's method.
+
+    Raises
+    ------
+    DataError
+        If the lens maps no ray to the pixel.
+    """
+    bent = (np.asarray(pixel, np.float64) - (k.cx, k.cy)) / (k.fx, k.fy)
+    if k.lens is None:
+        return np.asarray(bent)
+    lens, x, h = k.lens, bent.copy(), 1e-6
+    du, dv = np.array([h, 0.0]), np.array([0.0, h])
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON):
+            across = (lens.distort(x + du) - lens.distort(x - du)) / (2 * h)
+            along = (lens.distort(x + dv) - lens.distort(x - dv)) / (2 * h)
+            x = x - np.linalg.solve(np.stack([across, along], axis=-1), lens.distort(x) - bent)
+        off = np.linalg.norm(lens.distort(x) - bent) * max(k.fx, k.fy)
+        if not (off < 1e-3 and lens.project(np.append(x, 1.0))[1]):
+            raise DataError(f"expected a pixel that the lens maps a ray to, got {pixel[0]:g}, {pixel[1]:g}")
+    return x
 
 
 def _nearest_images(point: np.ndarray, ideal: np.ndarray, rotations: np.ndarray, centers: np.ndarray) -> np.ndarray:

@@ -25,34 +25,12 @@ from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import ImageFile, find_photographs, parsed
 from gs2d.data.scene import PointCloud
-from gs2d.data.undistort import Intrinsics, colmap_intrinsics
+from gs2d.data.undistort import COLMAP_MODELS, Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError, UnusableViewError
 
 # -- the files of a model ----------------------------------------------------------------------------------------------
 # Layouts: https://colmap.github.io/format.html. ``rigs`` and ``frames`` files of newer versions repeat the poses in
 # another form and are not read.
-#: model id -> (name, number of parameters)
-CAMERA_MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    12: ("SIMPLE_DIVISION", 4),
-    13: ("DIVISION", 5),
-    14: ("SIMPLE_FISHEYE", 3),
-    15: ("FISHEYE", 4),
-    16: ("EUCM", 6),
-    17: ("EQUIRECTANGULAR", 2),
-}
-
 PANORAMA = "EQUIRECTANGULAR"
 
 
@@ -210,13 +188,13 @@ def _cameras_bin(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     for number in range(1, count + 1):
         what = f"camera {number} of {count}"
         camera_id, model_id, width, height = map(int, file.unpack("IiQQ", what))
-        if model_id not in CAMERA_MODELS:
+        if not 0 <= model_id < len(COLMAP_MODELS):
             raise DataError(
-                f"{path}: camera {camera_id} has the unknown model id {model_id} (known: 0 to {max(CAMERA_MODELS)}); "
-                "run `colmap image_undistorter` and load its output"
+                f"{path}: camera {camera_id} has the unknown model id {model_id} (known: 0 to "
+                f"{len(COLMAP_MODELS) - 1}); run `colmap image_undistorter` and load its output"
             )
-        model, num_params = CAMERA_MODELS[model_id]
-        yield camera_id, ColmapCamera(model, width, height, file.unpack(f"{num_params}d", what))
+        model = list(COLMAP_MODELS)[model_id]
+        yield camera_id, ColmapCamera(model, width, height, file.unpack(f"{COLMAP_MODELS[model][0]}d", what))
     file.finish("camera")
 
 
