@@ -19,7 +19,6 @@ NEAR = 1e-3  # world units
 _MARGIN = 1e-6  # samples around the box of a triangle, for rounding
 JUMP = 3.0  # pixel footprints; a larger bend of the depth between pixels is an outline
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
-Size = tuple[int, int]  # rows, columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +90,19 @@ def cast_camera(
         )
         ray = (pair_y[inside] * width + pair_x[inside])[hit]
         np.minimum.at(nearest, ray, key)
-    hits = _hits(nearest, edges, directions_x, directions_y)
-    numbers = np.append(met, -1).astype(np.int32)  # -1 without a hit
-    return Hits(numbers[hits.face], hits.depth, hits.weights)
+    hit = nearest != _NO_HIT
+    face, depth = np.full(len(nearest), -1, np.int32), np.zeros(len(nearest), np.float32)
+    weights = np.zeros((len(nearest), 3), np.float32)
+    depth[hit] = (nearest[hit] >> np.uint64(32)).astype(np.uint32).view(np.float32)
+    every, found = np.flatnonzero(hit), (nearest[hit] & np.uint64(0xFFFFFFFF)).astype(np.int32)
+    face[hit] = met[found]
+    for start in range(0, len(every), _PAIRS_PER_CHUNK):
+        part = slice(start, start + _PAIRS_PER_CHUNK)
+        rays = every[part]
+        directions = np.stack([directions_x[rays % width], directions_y[rays // width], np.ones(len(rays))], axis=1)
+        e = np.einsum("rki,ri->rk", edges[found[part]], directions)
+        weights[rays] = e / e.sum(axis=1, keepdims=True)
+    return Hits(face.reshape(height, width), depth.reshape(height, width), weights.reshape(height, width, 3))
 
 
 def outlines(depth: np.ndarray, focal: float) -> np.ndarray:
@@ -112,54 +121,6 @@ def outlines(depth: np.ndarray, focal: float) -> np.ndarray:
     middle = inverse[1:-1]
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(inverse[:-2] + inverse[2:] - 2 * middle))
     return np.asarray(bend * depth * focal > JUMP)
-
-
-def cast_down(vertices: np.ndarray, faces: np.ndarray, corner: tuple[float, float], step: float, size: Size) -> Hits:
-    """Cast a ray straight down (-z) through every cell of a raster and keep the highest triangle of each.
-
-    With (x, y, 1) of a cell centre as the ray, and of the corners as the triangle, the three volumes of
-    :func:`cast_camera` are twice the areas of the parts of the triangle, seen from above.
-
-    Parameters
-    ----------
-    vertices : ndarray [P, 3] world units
-        z is up.
-    faces : ndarray [F, 3] int
-    corner : (float, float), world units
-        x and y of the upper left corner of the raster, with the lowest x and the highest y.
-    step : float, world units
-        Side of a cell. x increases with the column, y decreases with the row.
-    size : (int, int)
-        Rows and columns.
-
-    Returns
-    -------
-    Hits
-        Of size [rows, columns]; ``depth`` is measured downwards from one above the highest vertex.
-    """
-    height, width = size
-    flat = np.stack([(vertices[:, 0] - corner[0]) / step, (corner[1] - vertices[:, 1]) / step], axis=1)  # in cells
-    top = float(vertices[:, 2].max()) + 1.0
-    corners = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)[faces]  # [F, 3, 3]
-    a, b, c = (corners[:, k] for k in range(3))
-    edges = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
-    below = top - vertices[faces, 2]  # [F, 3]
-    limit = np.array([width, height])
-    low = np.clip(np.ceil(corners[:, :, :2].min(axis=1) - 0.5 - _MARGIN), 0, limit).astype(np.int64)
-    high = np.clip(np.floor(corners[:, :, :2].max(axis=1) - 0.5 + _MARGIN) + 1, 0, limit).astype(np.int64)
-    columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
-
-    nearest = np.full(width * height, _NO_HIT, dtype=np.uint64)
-    for face, x, y in pairs(low, high):
-        e = [edges[face, k, 0] * columns[x] + edges[face, k, 1] * rows[y] + edges[face, k, 2] for k in range(3)]
-        inside = same_sign(*e)
-        total = sum(part[inside] for part in e)
-        met = face[inside]
-        depth = sum(part[inside] * below[met, k] for k, part in enumerate(e)) / np.where(total == 0, np.inf, total)
-        flat_on = depth > 0  # otherwise the triangle is vertical
-        key = depth[flat_on].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
-        np.minimum.at(nearest, (y[inside] * width + x[inside])[flat_on], key | met[flat_on].astype(np.uint64))
-    return _hits(nearest, edges, columns, rows)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -240,23 +201,6 @@ def pairs(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.nd
         row, column = np.divmod(within, extent[box, 0])
         yield box, low[box, 0] + column, low[box, 1] + row
         start = stop
-
-
-def _hits(nearest: np.ndarray, edges: np.ndarray, directions_x: np.ndarray, directions_y: np.ndarray) -> Hits:
-    height, width = len(directions_y), len(directions_x)
-    hit = nearest != _NO_HIT
-    face = np.full(width * height, -1, dtype=np.int32)
-    face[hit] = (nearest[hit] & np.uint64(0xFFFFFFFF)).astype(np.int32)
-    depth = np.zeros(width * height, dtype=np.float32)
-    depth[hit] = (nearest[hit] >> np.uint64(32)).astype(np.uint32).view(np.float32)
-    weights = np.zeros((width * height, 3), dtype=np.float32)
-    every = np.flatnonzero(hit)
-    for start in range(0, len(every), _PAIRS_PER_CHUNK):
-        rays = every[start : start + _PAIRS_PER_CHUNK]
-        directions = np.stack([directions_x[rays % width], directions_y[rays // width], np.ones(len(rays))], axis=1)
-        e = np.einsum("rki,ri->rk", edges[face[rays]], directions)
-        weights[rays] = e / e.sum(axis=1, keepdims=True)
-    return Hits(face.reshape(height, width), depth.reshape(height, width), weights.reshape(height, width, 3))
 
 
 def same_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

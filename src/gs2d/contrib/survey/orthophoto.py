@@ -15,12 +15,13 @@ from gs2d.contrib.survey.georeference import Georeference, required_georeference
 from gs2d.contrib.survey.geotiff import NO_DATA, write_geotiff
 from gs2d.contrib.survey.survey_commands import OrthophotoOptions
 from gs2d.core.atomic_files import check_writable
+from gs2d.core.camera import Camera
 from gs2d.core.extras import required
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.meshing.raycast import Hits, cast_down
+from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import Texels, surface_colors
 from gs2d.pipeline.finish.run_texture import photographs
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
@@ -81,7 +82,7 @@ def orthophoto_run(
     local = place.to_local(mesh.vertices)
     raster = _raster(local, options.resolution, _pixel(job, mesh) * place.scale)
     on_event(Phase("rendering from above", 0))
-    hits = cast_down(local, mesh.faces, raster.corner, raster.step, raster.size)
+    hits = from_above(local, mesh.faces, raster)
     colors, unseen = _colors(job, mesh, hits, on_event)
     _write(files, colors, _elevations(local, mesh, hits, place), raster, place)
     return {
@@ -130,6 +131,24 @@ def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster
         )
     corner = float(first[0] * resolution), float(last[1] * resolution)
     return Raster(corner, resolution, (int(rows), int(columns)))
+
+
+def from_above(vertices: np.ndarray, faces: np.ndarray, raster: Raster) -> Hits:
+    """Cast a ray straight down through every cell, and keep the highest triangle of each; ``depth`` has no meaning.
+
+    The map (x, y, 1) / q, with q linear in the height, keeps planes flat and makes vertical lines the rays of a camera
+    whose pixels are the cells; higher points are nearer.
+    """
+    (rows, columns), (left, top) = raster.size, raster.corner
+    x, y, z = vertices.T
+    q = np.asarray(1 + (z - z.min()) / max(float(np.ptp(z)), 1e-30), np.float32)
+    mapped = np.stack([(x - left) / raster.step, (top - y) / raster.step, np.ones(len(z))], axis=1) / q[:, None]
+    hits = cast_camera(mapped, faces, Camera(columns, rows, 1.0, 1.0, 0.0, 0.0, np.eye(4)))
+    for k in range(3):  # barycentric coordinates are mapped, too
+        hits.weights[..., k] /= q[faces[hits.face, k]]
+    total = hits.weights.sum(axis=2, keepdims=True)
+    np.divide(hits.weights, total, out=hits.weights, where=total > 0)
+    return hits
 
 
 def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[np.ndarray, int]:
