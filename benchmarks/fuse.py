@@ -26,6 +26,7 @@ import numpy as np
 from benchmarks.timing import machine
 from gs2d.contrib.surfaces.unbounded import derive_cascade, find_cascade_blocks, fused_cascade_surface
 from gs2d.core.camera import Camera, look_at
+from gs2d.kernels.library import load
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.evidence import gather
@@ -94,6 +95,7 @@ def run(
         cpu[name] = round(time.process_time() - processor, 3)
         return value
 
+    load().use_threads(threads)
     cameras = orbit(views, size)
     maps = [sphere_map(camera) for camera in cameras]
     samples = timed("sample", lambda: [sample_depths(item) for item in maps])
@@ -104,14 +106,14 @@ def run(
     if unbounded:
         core = np.array([[-RADIUS] * 3, [RADIUS] * 3]) / 2
         cascade = derive_cascade(samples, cameras, bbox=core, voxel=limits.voxel, truncation=limits.truncation)
-        levels = timed("blocks", lambda: find_cascade_blocks(maps, cascade, threads=threads))
+        levels = timed("blocks", lambda: find_cascade_blocks(maps, cascade))
         mesh = timed(
             "fuse",
-            lambda: fused_cascade_surface(maps, cascade, levels, far_weight=1.0, threads=threads, backend=backend),
+            lambda: fused_cascade_surface(maps, cascade, levels, far_weight=1.0, backend=backend),
         )
     else:
-        levels = timed("blocks", lambda: (find_blocks(maps, limits, threads=threads),))
-        mesh = timed("fuse", lambda: fused_surface(maps, limits, levels[0], threads=threads, backend=backend))
+        levels = timed("blocks", lambda: (find_blocks(maps, limits),))
+        mesh = timed("fuse", lambda: fused_surface(maps, limits, levels[0], backend=backend))
     mesh = timed("components", lambda: keep_components(mesh))
     timed("evidence", lambda: gather(mesh, maps, limits.truncation))
     error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() / limits.voxel

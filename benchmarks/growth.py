@@ -127,7 +127,7 @@ def meshing(width: int, height: int) -> Step:
     limits = derive_limits([sample_depths(m) for m in maps], [m.camera for m in maps], resolution=width // 4)
 
     def step() -> None:
-        keep_components(fused_surface(maps, limits, find_blocks(maps, limits, threads=1), threads=1))
+        keep_components(fused_surface(maps, limits, find_blocks(maps, limits)))
 
     return step
 

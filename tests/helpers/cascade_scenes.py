@@ -58,15 +58,12 @@ def fused_levels(
     maps: Sequence[DepthMap],
     cascade: TsdfCascade,
     *,
-    threads: int = 1,
     backend: str = "auto",
     slab_bytes: int = 1 << 40,
 ) -> Mesh:
     """Fuse depth maps into all levels and extract their surface."""
-    blocks = find_cascade_blocks(maps, cascade, threads=threads)
-    return fused_cascade_surface(
-        maps, cascade, blocks, far_weight=1.0, slab_bytes=slab_bytes, threads=threads, backend=backend
-    )
+    blocks = find_cascade_blocks(maps, cascade)
+    return fused_cascade_surface(maps, cascade, blocks, far_weight=1.0, slab_bytes=slab_bytes, backend=backend)
 
 
 def outdoor_frames(sky: str, *, views: int = 24, size: int = 96, seed: int = 0) -> list[RenderedView]:

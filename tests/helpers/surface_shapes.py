@@ -8,6 +8,7 @@ import numpy as np
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
+from gs2d.kernels.library import load
 from gs2d.meshing.depth_maps import DepthMap, RenderedView
 from gs2d.meshing.fusion_bounds import FusionBounds
 from gs2d.meshing.marching_cubes import cell_surface, edge_vertices
@@ -18,8 +19,10 @@ def fuse(
     maps: Sequence[DepthMap], lim: FusionBounds, *, threads: int = 1, backend: str = "auto", max_bytes: int = 4 << 30
 ) -> Volume:
     """Fuse depth maps into one volume."""
-    blocks = find_blocks(maps, lim, max_bytes=max_bytes, threads=threads)
-    return fuse_blocks(maps, lim, blocks, threads=threads, backend=backend)
+    blocks = find_blocks(maps, lim, max_bytes=max_bytes)
+    if threads > 1:
+        load().use_threads(threads)
+    return fuse_blocks(maps, lim, blocks, backend=backend)
 
 
 def marching_cubes(volume: Volume, min_weight: float = 1.0) -> Mesh:

@@ -17,8 +17,8 @@ from gs2d.meshing.delaunay import extract_delaunay
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.evidence import areas
 from gs2d.meshing.extract import ExtractOptions
+from gs2d.meshing.minimum_cut import UNIT, Lines, cast_votes
 from gs2d.meshing.tetrahedra import CUBE, FACES, Tetrahedra, divide
-from gs2d.meshing.visibility_votes import UNIT, Lines, cast_votes
 from surface_shapes import orbit, rays, sphere_depth
 
 BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])

@@ -76,7 +76,7 @@ def test_a_voxel_changes_as_computed_by_hand() -> None:
     """
     volume, first, camera = wall(1.5)
     second = depth_map(RenderedView(camera, np.full((64, 64), 1.75), np.full((64, 64, 3), 100, np.uint8)))
-    with integrator([volume], "cpu", 1) as add:
+    with integrator([volume], None) as add:
         for item in (first, second):
             add(make_sampler(item, volume.limits))
     z = volume.tsdf[0].reshape(8, 8, 8)[4, 4]

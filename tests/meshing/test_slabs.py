@@ -27,11 +27,11 @@ def maps(*, colored: bool) -> list[DepthMap]:
 def test_the_mesh_does_not_depend_on_slabs(colored: bool, fraction: float) -> None:
     seen = maps(colored=colored)
     limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.05)
-    blocks = find_blocks(seen, limits, threads=1)
+    blocks = find_blocks(seen, limits)
     most = int(fraction * blocks.nbytes)
     assert len(list(slabs(blocks, most))) > 1
     whole = marching_cubes(fuse(seen, limits))
-    parts = fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)
+    parts = fused_surface(seen, limits, blocks, slab_bytes=most)
     assert len(whole.faces) > 1000
     np.testing.assert_array_equal(parts.vertices, whole.vertices)
     np.testing.assert_array_equal(parts.faces, whole.faces)
@@ -44,7 +44,7 @@ def test_the_mesh_does_not_depend_on_slabs(colored: bool, fraction: float) -> No
 def test_slabs_respect_the_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = maps(colored=False)
     limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.04)
-    blocks = find_blocks(seen, limits, threads=1)
+    blocks = find_blocks(seen, limits)
     most = blocks.nbytes // 2
     held: list[int] = []
 
@@ -54,7 +54,7 @@ def test_slabs_respect_the_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None
         return volume
 
     monkeypatch.setattr("gs2d.meshing.slabs.fuse_blocks", recorded)
-    fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)
+    fused_surface(seen, limits, blocks, slab_bytes=most)
     assert len(held) > 1
     assert max(held) <= most
     rows = list(slabs(blocks, block_bytes(False)))  # no layer fits: each is a slab, together with the next one

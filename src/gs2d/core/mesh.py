@@ -27,9 +27,8 @@ class Mesh:
     colors: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        check_shapes({"vertices": (self.vertices, "P 3"), "faces": (self.faces, "F 3")})
-        if self.colors is not None:
-            check_shapes({"vertices": (self.vertices, "P 3"), "colors": (self.colors, "P 3")})
+        colors = {} if self.colors is None else {"colors": (self.colors, "P 3")}
+        check_shapes({"vertices": (self.vertices, "P 3"), "faces": (self.faces, "F 3"), **colors})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the mesh to a file: .ply or .glb.

@@ -6,8 +6,8 @@ import os
 import pickle
 import tempfile
 import weakref
-from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from typing import IO, Any, Generic, TypeVar, overload
 
 from gs2d.errors import DiskError
@@ -17,9 +17,22 @@ RECENT = 32  # values from the file that are cached: neighbouring views are requ
 
 
 class SpillFile:
-    """Pickled values in an anonymous file, in the temporary folder (``TMPDIR``); it is deleted with the object."""
+    """Pickled values in an anonymous file, in the temporary folder (``TMPDIR``); it is deleted with the object.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    what : str
+        Description of the values in errors.
+    remedies : str
+        Other remedies than free space.
+    """
+
+    def __init__(
+        self,
+        what: str = "data that does not fit in memory",
+        remedies: str = "set TMPDIR to another folder, or allow more --memory",
+    ) -> None:
+        self._what, self._remedies = what, remedies
         self._file: IO[bytes] | None = None
 
     def put(self, packed: bytes) -> tuple[int, int]:
@@ -39,8 +52,8 @@ class SpillFile:
             return place
         except OSError as error:
             raise DiskError(
-                f"cannot write a temporary file for data that does not fit in memory ({error.strerror or error}); free "
-                "some space, set TMPDIR to another folder, or allow more --memory",
+                f"cannot write a temporary file for {self._what} ({error.strerror or error}); free some space, "
+                f"{self._remedies}",
                 error.errno,
             ) from error
 
@@ -69,8 +82,8 @@ class Spilled(Sequence[T], Generic[T]):
     def __init__(self, values: Iterable[T], limit_bytes: int) -> None:
         self._kept: list[T] = []
         self._slots: list[tuple[int, int]] = []
-        self._recent: OrderedDict[int, T] = OrderedDict()
         self._file = SpillFile()
+        self._read: Callable[[tuple[int, int]], T] = lru_cache(RECENT)(self._file.get)
         room = limit_bytes
         for value in values:
             packed = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
@@ -96,23 +109,11 @@ class Spilled(Sequence[T], Generic[T]):
         if isinstance(index, slice):
             return [self[at] for at in range(*index.indices(len(self)))]
         at = range(len(self))[index]
-        if at < len(self._kept):
-            return self._kept[at]
-        if at in self._recent:
-            self._recent.move_to_end(at)
-            return self._recent[at]
-        value: T = self._file.get(self._slots[at - len(self._kept)])
-        self._recent[at] = value
-        if len(self._recent) > RECENT:
-            self._recent.popitem(last=False)
-        return value
+        return self._kept[at] if at < len(self._kept) else self._read(self._slots[at - len(self._kept)])
 
     def column(self, number: int) -> Sequence[Any]:
         """Return the sequence of one entry of each value; values are tuples."""
         return _Column(self, number)
-
-    def __iter__(self) -> Iterator[T]:
-        return (self[at] for at in range(len(self)))
 
 
 class _Column(Sequence[Any]):

@@ -192,14 +192,9 @@ class PointCloud:
     sizes: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        shapes = {"points": (self.points, "P 3")}
-        if self.colors is not None:
-            shapes["colors"] = (self.colors, "P 3")
-        if self.normals is not None:
-            shapes["normals"] = (self.normals, "P 3")
-        if self.sizes is not None:
-            shapes["sizes"] = (self.sizes, "P")
-        check_shapes(shapes)
+        shapes = {"points": "P 3", "colors": "P 3", "normals": "P 3", "sizes": "P"}
+        arrays = {name: (getattr(self, name), shape) for name, shape in shapes.items()}
+        check_shapes({name: pair for name, pair in arrays.items() if pair[0] is not None})
 
     def __len__(self) -> int:
         return len(self.points)

@@ -18,15 +18,14 @@ from scipy.sparse.csgraph import connected_components
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
-from gs2d.kernels.library import Library, ready_library
-from gs2d.meshing.consistency import depth_noise
+from gs2d.kernels.library import Library, load
 from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import clean
-from gs2d.meshing.extract import Extraction, ExtractOptions, fused_depths, sampled
-from gs2d.meshing.fusion_bounds import FusionBounds, backproject, derive_limits, widen_truncation
+from gs2d.meshing.extract import Extraction, ExtractOptions, bounds_of, fused_depths, spooled
+from gs2d.meshing.fusion_bounds import FusionBounds, backproject
 from gs2d.meshing.marching_cubes import inside_box, keep_components, select_faces
 from gs2d.meshing.mesh_methods import register_mesh_method
-from gs2d.meshing.minimum_cut import outside
+from gs2d.meshing.minimum_cut import Lines, cast_votes, outside
 from gs2d.meshing.oriented_points import (
     PIXELS_APART,
     OrientedPoints,
@@ -38,7 +37,6 @@ from gs2d.meshing.oriented_points import (
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.tetrahedra import FACES, Tetrahedra, divide
 from gs2d.meshing.tsdf_volume import fusion_backend
-from gs2d.meshing.visibility_votes import Lines, cast_votes
 from gs2d.render.backends import Backend
 
 BYTES_A_POINT = 2500  # of tetrahedra, votes and cut, at their peak
@@ -55,7 +53,7 @@ TAUBIN_ROUNDS = 2
 
 @register_mesh_method("delaunay")
 def extract_delaunay(
-    frames: Iterable[RenderedView] | Spool,
+    frames: Iterable[RenderedView],
     options: ExtractOptions = ExtractOptions(),  # noqa: B008 (frozen)
     *,
     threads: int | None = None,
@@ -84,37 +82,34 @@ def extract_delaunay(
         As for ``extract``.
     """
     backend = fusion_backend(backend)
-    library = ready_library()
-    with Spool.of(frames) as spool:
-        if len(spool) < 2:
-            raise ProtocolError(f"a mesh by Delaunay needs two or more views, got {len(spool)}; use --method tsdf")
-        samples = sampled(spool)
-        limits = derive_limits(samples, spool.cameras, **options.limits)
-        if options.truncation is None:
-            limits = widen_truncation(limits, depth_noise(spool, samples, limits))
-        del samples
-        fused, volume_bytes = fused_depths(spool, limits, options, threads=threads, backend=backend)
-        points = _points(fused, spool, limits, options)
-        del fused
-        trim()
-        space, lines = _sight(points, spool, limits, library)
-        votes = cast_votes(space, lines, library)
-        del lines
-        out = outside(space, votes, library, closed=options.watertight, spacing=points.spacing)
-        del votes
-        mesh = _surface(space, points, out, closed=options.watertight)
-        del space, out
-        trim()
-        mesh = _taubin(mesh)
-        pixels = None
-        if not options.watertight:
-            mesh = mesh if options.bbox is None else inside_box(mesh, options.bbox)
-            if options.by_evidence:
-                mesh, pixels = clean(mesh, spool, limits.truncation, small=SMALL)
-        mesh = keep_components(mesh, keep=options.keep)
-        mesh = simplify(mesh, error=options.error, cameras=spool.cameras)
-        volume_bytes = max(volume_bytes, BYTES_A_POINT * len(points.xyz))
-        return Extraction(mesh, limits, len(spool), volume_bytes, 1, backend.name, pixels)
+    spool, samples = spooled(frames, threads)
+    if len(spool) < 2:
+        raise ProtocolError(f"a mesh by Delaunay needs two or more views, got {len(spool)}; use --method tsdf")
+    limits = bounds_of(spool, samples, options)
+    del samples
+    fused, volume_bytes = fused_depths(spool, limits, options, backend)
+    points = _points(fused, spool, limits, options)
+    del fused
+    trim()
+    library = load()
+    space, lines = _sight(points, spool, limits, library)
+    votes = cast_votes(space, lines, library)
+    del lines
+    out = outside(space, votes, library, closed=options.watertight, spacing=points.spacing)
+    del votes
+    mesh = _surface(space, points, out, closed=options.watertight)
+    del space, out
+    trim()
+    mesh = _taubin(mesh)
+    pixels = None
+    if not options.watertight:
+        mesh = mesh if options.bbox is None else inside_box(mesh, options.bbox)
+        if options.by_evidence:
+            mesh, pixels = clean(mesh, spool, limits.truncation, small=SMALL)
+    mesh = keep_components(mesh, keep=options.keep)
+    mesh = simplify(mesh, error=options.error, cameras=spool.cameras)
+    volume_bytes = max(volume_bytes, BYTES_A_POINT * len(points.xyz))
+    return Extraction(mesh, limits, len(spool), volume_bytes, 1, backend.name, pixels)
 
 
 def _points(fused: Mesh, spool: Spool, limits: FusionBounds, options: ExtractOptions) -> OrientedPoints:
@@ -138,16 +133,16 @@ def _points(fused: Mesh, spool: Spool, limits: FusionBounds, options: ExtractOpt
 def _sight(points: OrientedPoints, spool: Spool, limits: FusionBounds, library: Library) -> tuple[Tetrahedra, Lines]:
     """Return tetrahedra of the points and of points beyond the scene, and the lines of sight to both."""
     centers = np.array([camera.center for camera in spool.cameras])
-    seen = sight_lines(points, spool, limits, most=LINES_A_POINT)
+    seen, cameras, weights = sight_lines(points, spool, limits, most=LINES_A_POINT)
     past, past_cameras = _beyond(spool, limits)
     space = divide(np.concatenate([points.xyz, past]), centers, library)
-    sigma = np.maximum(points.spread, points.spacing)[seen.points]
+    sigma = np.maximum(points.spread, points.spacing)[seen]
     lines = Lines(
-        np.concatenate([seen.points, len(points.xyz) + np.arange(len(past))]).astype(np.int32),
-        np.concatenate([centers[seen.cameras], centers[past_cameras]]),
+        np.concatenate([seen, len(points.xyz) + np.arange(len(past))]).astype(np.int32),
+        np.concatenate([centers[cameras], centers[past_cameras]]),
         np.concatenate([sigma, np.full(len(past), limits.voxel)]),
-        np.concatenate([seen.weights, np.ones(len(past))]),
-        len(seen.points),
+        np.concatenate([weights, np.ones(len(past))]),
+        len(seen),
     )
     return space, lines
 

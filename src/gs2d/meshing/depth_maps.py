@@ -6,19 +6,17 @@ that they are neither kept in memory nor rendered again.
 
 from __future__ import annotations
 
-import os
-import tempfile
+import pickle
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
-from gs2d.errors import DiskError, ShapeError
+from gs2d.core.spill import SpillFile
+from gs2d.errors import ShapeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,95 +87,32 @@ def _array(value: Any) -> np.ndarray:
     return np.asarray(value)
 
 
-@dataclass(frozen=True)
-class _Slot:
-    """Position of one depth map in the file."""
-
-    camera: Camera
-    offset: int
-    has_color: bool
-    has_weight: bool
-
-
 class Spool:
     """Depth maps in an unnamed temporary file, for repeated iteration.
 
+    Parameters
+    ----------
+    frames : iterable of RenderedView
+        Read once, checked and written one by one.
+
     Raises
     ------
+    ShapeError
+        If a frame is invalid.
     DiskError
-        If the file cannot be created.
+        If the file cannot be written.
     """
 
-    def __init__(self) -> None:
-        try:
-            self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
-        except OSError as error:
-            raise DiskError(f"Cannot create a temporary file for depth maps: {error.strerror}. Set TMPDIR.") from error
-        self._slots: list[_Slot] = []
-
-    def append(self, item: DepthMap) -> None:
-        """Write one depth map."""
-        try:
-            offset = self._file.seek(0, os.SEEK_END)
-            self._file.write(np.ascontiguousarray(item.depth, np.float32).tobytes())
-            if item.color is not None:
-                self._file.write(np.ascontiguousarray(item.color, np.uint8).tobytes())
-            if item.weight is not None:
-                self._file.write(np.ascontiguousarray(item.weight, np.float32).tobytes())
-            self._file.flush()
-        except OSError as error:
-            raise DiskError(
-                f"cannot write depth map {len(self._slots) + 1} to a temporary file ({error.strerror}); free some disk "
-                "space, or set TMPDIR to another folder"
-            ) from error
-        has = (part is not None for part in (item.color, item.weight))
-        self._slots.append(_Slot(item.camera, offset, *has))
-
-    @classmethod
-    @contextmanager
-    def of(cls, frames: Iterable[RenderedView] | Spool) -> Iterator[Spool]:
-        """Yield a spool of the frames, which is closed at the end. A spool is passed through and stays open."""
-        if isinstance(frames, Spool):
-            yield frames
-            return
-        with cls() as spool:
-            spool.extend(frames)
-            yield spool
-
-    def extend(self, frames: Iterable[RenderedView]) -> None:
-        """Check and write frames one by one."""
+    def __init__(self, frames: Iterable[RenderedView]) -> None:
+        self._file = SpillFile("depth maps", "or set TMPDIR to another folder")
+        self._places: list[tuple[int, int]] = []
+        self.cameras: list[Camera] = []
         for frame in frames:
-            self.append(depth_map(frame))
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """Cameras of the depth maps, in order."""
-        return [slot.camera for slot in self._slots]
+            self._places.append(self._file.put(pickle.dumps(depth_map(frame), protocol=pickle.HIGHEST_PROTOCOL)))
+            self.cameras.append(frame.camera)
 
     def __len__(self) -> int:
-        return len(self._slots)
+        return len(self._places)
 
     def __iter__(self) -> Iterator[DepthMap]:
-        for slot in self._slots:
-            self._file.seek(slot.offset)
-            shape = (slot.camera.height, slot.camera.width)
-            depth = self._read(np.float32, shape)
-            color = self._read(np.uint8, (*shape, 3)) if slot.has_color else None
-            weight = self._read(np.float32, shape) if slot.has_weight else None
-            yield DepthMap(slot.camera, depth, color, weight)
-
-    def _read(self, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
-        count = int(np.prod(shape))
-        return np.frombuffer(self._file.read(count * np.dtype(dtype).itemsize), dtype, count).reshape(shape)
-
-    def close(self) -> None:
-        """Close and delete the file."""
-        self._file.close()
-
-    def __enter__(self) -> Spool:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        return map(self._file.get, self._places)

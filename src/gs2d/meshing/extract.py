@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
+from gs2d.kernels.library import load
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import clean
@@ -87,7 +89,7 @@ class ExtractOptions:
 
 @register_mesh_method("tsdf")
 def extract(
-    frames: Iterable[RenderedView] | Spool,
+    frames: Iterable[RenderedView],
     options: ExtractOptions = ExtractOptions(),
     *,
     threads: int | None = None,
@@ -97,8 +99,8 @@ def extract(
 
     Parameters
     ----------
-    frames : iterable of RenderedView, or Spool
-        Read once (it may be a generator) and stored in a temporary file. A spool is used as it is, and stays open.
+    frames : iterable of RenderedView
+        Read once (it may be a generator) and stored in a temporary file.
     options : ExtractOptions
     threads : int, optional
     backend : str or Backend
@@ -116,42 +118,47 @@ def extract(
         If the backend is unknown or cannot run here.
     """
     backend = fusion_backend(backend)
-    with Spool.of(frames) as spool:
-        samples = sampled(spool)
-        limits = derive_limits(samples, spool.cameras, **options.limits)
-        if options.truncation is None:
-            limits = widen_truncation(limits, depth_noise(spool, samples, limits))
-        del samples
-        mesh, volume_bytes = fused_depths(spool, limits, options, threads=threads, backend=backend)
-        mesh = mesh if options.bbox is None else inside_box(mesh, options.bbox)
-        trim()  # returns the volume of the last slab
-        mesh = keep_components(mesh, keep=options.keep)
-        pixels = None
-        if options.by_evidence:
-            mesh, pixels = clean(mesh, spool, limits.truncation)
-        mesh = simplify(mesh, error=options.error, cameras=spool.cameras)
-        return Extraction(mesh, limits, len(spool), volume_bytes, 1, backend.name, pixels)
+    spool, samples = spooled(frames, threads)
+    limits = bounds_of(spool, samples, options)
+    del samples
+    mesh, volume_bytes = fused_depths(spool, limits, options, backend)
+    mesh = mesh if options.bbox is None else inside_box(mesh, options.bbox)
+    trim()  # returns the volume of the last slab
+    mesh = keep_components(mesh, keep=options.keep)
+    pixels = None
+    if options.by_evidence:
+        mesh, pixels = clean(mesh, spool, limits.truncation)
+    mesh = simplify(mesh, error=options.error, cameras=spool.cameras)
+    return Extraction(mesh, limits, len(spool), volume_bytes, 1, backend.name, pixels)
 
 
-def fused_depths(
-    spool: Spool, limits: FusionBounds, options: ExtractOptions, *, threads: int | None, backend: Backend
-) -> tuple[Mesh, int]:
+def spooled(frames: Iterable[RenderedView], threads: int | None) -> tuple[Spool, list[DepthSample]]:
+    """Store depth maps and sample their pixels: fewer of each if there are many, so that their total is bounded.
+
+    Then sets the number of threads of the native library (default: all cores), which rendering may change.
+    """
+    spool = Spool(frames)
+    load().use_threads(threads or os.cpu_count() or 1)
+    count = min(SAMPLES_A_MAP, max(FEWEST_SAMPLES, SAMPLES // max(len(spool), 1)))
+    return spool, [sample_depths(item, count) for item in spool]
+
+
+def bounds_of(spool: Spool, samples: Sequence[DepthSample], options: ExtractOptions) -> FusionBounds:
+    """Derive the limits of the fusion; the truncation grows with the disagreement of the depth maps."""
+    limits = derive_limits(samples, spool.cameras, **options.limits)
+    return widen_truncation(limits, None if options.truncation else depth_noise(spool, samples, limits))
+
+
+def fused_depths(spool: Spool, limits: FusionBounds, options: ExtractOptions, backend: Backend) -> tuple[Mesh, int]:
     """Return the surface of all components in the fused volume, and the bytes of the volume."""
     trim()  # returns 20 to 60 MB before the volume is allocated
-    blocks = find_blocks(spool, limits, max_bytes=options.max_bytes, threads=threads)
+    blocks = find_blocks(spool, limits, max_bytes=options.max_bytes)
     mesh = fused_surface(
         spool,
         limits,
         blocks,
         min_weight=options.min_weight,
         slab_bytes=options.slab_bytes,
-        threads=threads,
         backend=backend,
     )
     return mesh, blocks.nbytes
-
-
-def sampled(spool: Spool) -> list[DepthSample]:
-    """Sample pixels of all depth maps: fewer of each if there are many, so that their total is bounded."""
-    count = min(SAMPLES_A_MAP, max(FEWEST_SAMPLES, SAMPLES // max(len(spool), 1)))
-    return [sample_depths(item, count) for item in spool]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -57,30 +58,14 @@ class OrientedPoints:
 
     def rows(self, rows: np.ndarray) -> OrientedPoints:
         """Return some of the points."""
-        colors = None if self.colors is None else self.colors[rows]
-        return OrientedPoints(
-            self.xyz[rows], self.normals[rows], self.spacing[rows], self.spread[rows], self.views[rows], colors
-        )
-
-    @classmethod
-    def none(cls) -> OrientedPoints:
-        """Return no points."""
-        zeros, widths = np.zeros((0, 3)), np.zeros(0, np.float32)
-        return cls(zeros, zeros.astype(np.float32), widths, widths, np.zeros(0, np.int32), None)
+        chosen: list[Any] = [None if values is None else values[rows] for values in vars(self).values()]
+        return OrientedPoints(*chosen)
 
     def joined(self, others: OrientedPoints) -> OrientedPoints:
         """Return these and other points; without colours, if either has none."""
-        colors = None
-        if self.colors is not None and others.colors is not None:
-            colors = np.concatenate([self.colors, others.colors])
-        return OrientedPoints(
-            np.concatenate([self.xyz, others.xyz]),
-            np.concatenate([self.normals, others.normals]),
-            np.concatenate([self.spacing, others.spacing]),
-            np.concatenate([self.spread, others.spread]),
-            np.concatenate([self.views, others.views]),
-            colors,
-        )
+        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
+        both: list[Any] = [None if a is None or b is None else np.concatenate([a, b]) for a, b in pairs]
+        return OrientedPoints(*both)
 
     def apart_from(self, others: OrientedPoints) -> OrientedPoints:
         """Return the points that are farther than ``APART`` spacings from all ``others``."""
@@ -89,29 +74,8 @@ class OrientedPoints:
         return self.rows(np.flatnonzero(cKDTree(others.xyz).query(self.xyz)[0] > APART * self.spacing))
 
 
-@dataclass(frozen=True, eq=False)
-class SightLines:
-    """Lines from camera centres to the points that they see.
-
-    Attributes
-    ----------
-    points : ndarray [L] int32
-    cameras : ndarray [L] int32
-    weights : ndarray [L] float32
-        Weight of the pixel.
-    """
-
-    points: np.ndarray
-    cameras: np.ndarray
-    weights: np.ndarray
-
-
-def merge_vertices(
-    mesh: Mesh, cameras: Sequence[Camera], limits: FusionBounds, *, apart: float = PIXELS_APART
-) -> OrientedPoints:
+def merge_vertices(mesh: Mesh, cameras: Sequence[Camera], limits: FusionBounds, *, apart: float) -> OrientedPoints:
     """Merge the vertices of a fused surface in voxels, as ``merge_pixels`` does, but never those of opposite sides."""
-    if not len(mesh.faces):
-        return OrientedPoints.none()
     xyz, normals = mesh.vertices.astype(np.float64), vertex_normals(mesh).astype(np.float64)
     base = apart * limits.pixel_footprint
     levels = np.clip(np.rint(np.log2(apart / pixel_scale(xyz, cameras) / base)), -12, 12).astype(np.int8)
@@ -123,9 +87,7 @@ def merge_vertices(
     return _points(merged, base, colored=mesh.colors is not None)
 
 
-def merge_pixels(
-    maps: Iterable[DepthMap], limits: FusionBounds, *, apart: float = PIXELS_APART, stride: int = 1
-) -> OrientedPoints:
+def merge_pixels(maps: Iterable[DepthMap], limits: FusionBounds, *, apart: float) -> OrientedPoints:
     """Merge the valid pixels of all maps in voxels of 2^k times a base width, by the width of a pixel there.
 
     Parameters
@@ -137,12 +99,13 @@ def merge_pixels(
         Width of a voxel. Where a view shows a part of the surface at a finer scale than others, its voxels alone stay.
     """
     base = apart * limits.pixel_footprint
-    merged, waiting = _Voxels.none(), []
+    merged: list[_Voxels] = []
+    waiting: list[_Voxels] = []
     for item in maps:
-        waiting.append(_voxels(item, limits, base, apart, stride))
+        waiting.append(_voxels(item, limits, base, apart))
         if sum(len(part.keys) for part in waiting) > MERGE_AT_ONCE:
-            merged, waiting = _merged([merged, *waiting]), []
-    return _points(_finest(_merged([merged, *waiting]), np.asarray(limits.lower), base), base, colored=False)
+            merged, waiting = [_merged(merged + waiting)], []
+    return _points(_finest(_merged(merged + waiting), np.asarray(limits.lower), base), base, colored=False)
 
 
 def _points(merged: _Voxels, base: float, *, colored: bool) -> OrientedPoints:
@@ -167,18 +130,12 @@ class _Voxels:
     levels: np.ndarray  # [N] int8
     sums: np.ndarray  # [N, 7 or 10] float64
 
-    @classmethod
-    def none(cls) -> _Voxels:
-        return cls(np.zeros(0, np.uint64), np.zeros(0, np.int8), np.zeros((0, 7)))
 
-
-def _voxels(item: DepthMap, limits: FusionBounds, base: float, apart: float, stride: int) -> _Voxels:
+def _voxels(item: DepthMap, limits: FusionBounds, base: float, apart: float) -> _Voxels:
     view, camera = make_sampler(item, limits), item.camera
     inner = np.zeros((view.height, view.width), bool)
-    inner[1:-1:stride, 1:-1:stride] = True
+    inner[1:-1, 1:-1] = True
     pixel = np.flatnonzero((view.depth > 0) & inner.ravel())
-    if not len(pixel):
-        return _Voxels.none()
     rows, columns = np.divmod(pixel, view.width)
     depth = view.depth[pixel].astype(np.float64)
     u, v = (columns - 0.5 - camera.cx) / camera.fx, (rows - 0.5 - camera.cy) / camera.fy
@@ -213,9 +170,7 @@ def _merged(parts: list[_Voxels]) -> _Voxels:
     sums = np.concatenate([part.sums for part in parts])
     order = np.lexsort((keys, levels))
     keys, levels, sums = keys[order], levels[order], sums[order]
-    if not len(keys):
-        return _Voxels.none()
-    first = np.flatnonzero(np.r_[True, (keys[1:] != keys[:-1]) | (levels[1:] != levels[:-1])])
+    first = np.flatnonzero(np.r_[len(keys) > 0, (keys[1:] != keys[:-1]) | (levels[1:] != levels[:-1])])
     return _Voxels(keys[first], levels[first], np.add.reduceat(sums, first, axis=0))
 
 
@@ -313,8 +268,17 @@ def settle(points: OrientedPoints, spool: Spool, limits: FusionBounds, *, rounds
     return points
 
 
-def sight_lines(points: OrientedPoints, spool: Spool, limits: FusionBounds, *, most: int) -> SightLines:
-    """Return at most about ``most`` lines of sight a point, chosen by a fixed rule and weighted by the rest."""
+def sight_lines(
+    points: OrientedPoints, spool: Spool, limits: FusionBounds, *, most: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return at most about ``most`` lines of sight a point, chosen by a fixed rule and weighted by the rest.
+
+    Returns
+    -------
+    points, cameras : ndarray [L] int32
+    weights : ndarray [L] float32
+        Weight of the pixel, times the lines that the chosen one stands for.
+    """
     reach = np.full(len(points.xyz), limits.truncation)
     share = np.minimum(1.0, most / np.maximum(points.views, 1))
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -328,4 +292,4 @@ def sight_lines(points: OrientedPoints, spool: Spool, limits: FusionBounds, *, m
         rows = seen.rows[chosen]
         found.append((rows, np.full(len(rows), number), seen.weights[chosen] / share[rows]))
     rows, cameras, weights = (np.concatenate(part) for part in zip(*found, strict=True))
-    return SightLines(rows.astype(np.int32), cameras.astype(np.int32), weights.astype(np.float32))
+    return rows.astype(np.int32), cameras.astype(np.int32), weights.astype(np.float32)

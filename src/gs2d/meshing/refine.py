@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -44,7 +45,9 @@ from gs2d.meshing.warped_ncc import (
     match_views,
 )
 
+T = TypeVar("T")
 CACHE_BYTES = 1 << 29  # limit for images and depth maps in memory
+BYTES_A_PIXEL = 8  # of a face and a depth; photographs have fewer
 SMALL_SIDE = 100  # px, shorter side of the images in which neighbours are chosen
 SEEN_AGAIN = 0.05  # of the depth: tolerance of these coarse images
 POINTS = 600  # of a view that compare its neighbours
@@ -101,26 +104,6 @@ class RefineSettings:
     match: MatchSettings = field(default_factory=MatchSettings)
 
 
-class _Kept:
-    """Results of a function of an index; the last that fit in ``limit`` bytes are kept."""
-
-    def __init__(self, make: Callable[[int], Any], limit: int) -> None:
-        self._make, self._limit, self._kept = make, limit, dict[int, Any]()
-
-    def __call__(self, index: int) -> Any:
-        found = self._kept.pop(index, None)
-        if found is None:
-            found = self._make(index)
-            while self._kept and self._size(found) * (len(self._kept) + 1) > self._limit:
-                self._kept.pop(next(iter(self._kept)))
-        self._kept[index] = found
-        return found
-
-    @staticmethod
-    def _size(item: Any) -> int:
-        return sum(value.nbytes for value in vars(item).values() if isinstance(value, np.ndarray))
-
-
 @dataclass(frozen=True, eq=False)
 class _Moving:
     """Vertices, and what moves with them.
@@ -157,13 +140,8 @@ class _Moving:
         return self.start + self.kept[:, None] * (self.vertices - self.start)
 
 
-@dataclass(frozen=True, eq=False)
-class _ComparedView:
-    """A photograph, the mesh in it, and its neighbours with the depth [h, w] of the mesh."""
-
-    image: GreyImage
-    drawn: DrawnMesh
-    neighbours: Sequence[tuple[GreyImage, np.ndarray]]
+ComparedView = tuple[GreyImage, DrawnMesh, Sequence[tuple[GreyImage, np.ndarray]]]
+"""A photograph, the mesh in it, and its neighbours with the depth [h, w] of the mesh."""
 
 
 class Refinement:
@@ -242,29 +220,29 @@ class Refinement:
     def _seen(self, mesh: Mesh) -> Evidence:
         """Return which views see the vertices, and at how many pixels per unit of surface."""
         depths: list[float] = []
-
-        def maps() -> Iterator[DepthMap]:
-            for camera in self._cameras:
-                yield DepthMap(camera, self._draw(mesh.vertices, mesh.faces, camera).depth, None, None)
-
         for camera in self._cameras:
             depth = camera.project(mesh.vertices[:: max(1, len(mesh.vertices) // POINTS)])[1]
             depths.extend(depth[depth > 0])
-        return gather(mesh, maps(), self._settings.match.occluded * float(np.median(depths or [0.0])))
+        maps = (
+            DepthMap(c, draw_mesh(mesh.vertices, mesh.faces, c, self._library).depth, None, None) for c in self._cameras
+        )
+        return gather(mesh, maps, self._settings.match.occluded * float(np.median(depths or [0.0])))
 
-    def _draw(self, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> DrawnMesh:
-        return draw_mesh(vertices, faces, camera, self._library)
+    def _cached(self, make: Callable[[int], T], cameras: Sequence[Camera]) -> Callable[[int], T]:
+        """Cache a function of the index of a view; as many results as fit in memory."""
+        largest = BYTES_A_PIXEL * max(camera.width * camera.height for camera in cameras)
+        return lru_cache(max(1, self._room // largest))(make)
 
     def _at_size(
         self, now: _Moving, factor: int, neighbours: Sequence[Sequence[int]], on_work: Callable[[int], None]
     ) -> _Moving:
         """Take the steps at one size of the photographs; at the first, find out which moves are kept."""
         cameras = [camera.downscaled(factor) for camera in self._cameras]
-        photographs = _Kept(lambda index: self._photographs(index, factor), self._room)
+        photographs = self._cached(lambda index: self._photographs(index, factor), cameras)
         curvature = Curvature.of(now.vertices, now.faces, now.normals())
         bend = curvature.smooth(SMOOTH_RINGS)
 
-        def views(surface: Surface) -> Iterator[_ComparedView]:
+        def views(surface: Surface) -> Iterator[ComparedView]:
             for view in self._views(surface, cameras, photographs, neighbours):
                 yield view
                 self._done += self._cost(factor)
@@ -284,39 +262,39 @@ class Refinement:
         cameras: Sequence[Camera],
         photographs: Callable[[int], GreyImage],
         neighbours: Sequence[Sequence[int]],
-    ) -> Iterator[_ComparedView]:
+    ) -> Iterator[ComparedView]:
         """Yield the views and their neighbours."""
-        drawn = _Kept(lambda index: self._draw(surface.vertices, surface.faces, cameras[index]), self._room)
+
+        def draw(index: int) -> DrawnMesh:
+            return draw_mesh(surface.vertices, surface.faces, cameras[index], self._library)
 
         def usable(index: int) -> GreyImage:
             photograph, inner = photographs(index), drawn(index).inner(cameras[index].fx)
             return replace(photograph, usable=inner if photograph.usable is None else inner & photograph.usable)
 
-        images = _Kept(usable, self._room)
+        drawn, images = self._cached(draw, cameras), self._cached(usable, cameras)
         for index in range(len(cameras)):
             beside = [(images(other), drawn(other).depth) for other in neighbours[index]]
-            yield _ComparedView(images(index), drawn(index), beside)
+            yield images(index), drawn(index), beside
 
-    def _pulled(self, surface: Surface, views: Iterable[_ComparedView]) -> Pull:
+    def _pulled(self, surface: Surface, views: Iterable[ComparedView]) -> Pull:
         """Return the derivatives of all pairs."""
         match, pull = self._settings.match, Pull.zeros(len(surface.vertices))
-        for view in views:
-            camera, drawn = view.image.camera, view.drawn
+        for image, drawn, neighbours in views:
             by_pixel = Pull.zeros(drawn.depth.shape, drawn.depth.dtype)
-            for other, depth in view.neighbours:
-                match_views(view.image, other, drawn.depth, depth, match, by_pixel, self._library)
-            gather_vertices(surface, camera, drawn.face, by_pixel, pull, match, self._library)
+            for other, depth in neighbours:
+                match_views(image, other, drawn.depth, depth, match, by_pixel, self._library)
+            gather_vertices(surface, image.camera, drawn.face, by_pixel, pull, match, self._library)
         return pull
 
-    def _kept(self, surface: Surface, views: Iterable[_ComparedView], curvature: Curvature) -> np.ndarray:
+    def _kept(self, surface: Surface, views: Iterable[ComparedView], curvature: Curvature) -> np.ndarray:
         """Return the share of its move that each vertex keeps [P]: 1 on matt surface that photographs can compare."""
         settings, faces = self._settings, surface.faces
         sums = np.zeros((4, len(faces)))  # brightness and its weights, pixels that were compared and all pixels
-        for view in views:
-            drawn = view.drawn
+        for image, drawn, neighbours in views:
             at = drawn.face >= 0
-            for other, depth in view.neighbours:
-                share, weight = brightness_share(view.image, other, drawn.depth, depth, settings.match, self._library)
+            for other, depth in neighbours:
+                share, weight = brightness_share(image, other, drawn.depth, depth, settings.match, self._library)
                 compared = ~np.isnan(share)
                 for total, values in zip(sums, (np.nan_to_num(share) * weight, weight, compared, at), strict=True):
                     total += np.bincount(drawn.face[at], values[at], len(faces))

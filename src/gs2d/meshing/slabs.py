@@ -28,7 +28,6 @@ def fused_surface(
     *,
     min_weight: float = 1.0,
     slab_bytes: int = SLAB_BYTES,
-    threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Mesh:
     """Fuse depth maps and extract their surface, without the whole volume in memory.
@@ -44,7 +43,7 @@ def fused_surface(
         See ``cell_surface``.
     slab_bytes : int
         Limit for a slab; exceeded only if a single layer of blocks and the next one do not fit.
-    threads, backend
+    backend
         As for ``fuse_blocks``.
     """
     edges: list[np.ndarray] = []
@@ -53,7 +52,7 @@ def fused_surface(
     faces: list[np.ndarray] = []
     before = 0  # number of vertices of the earlier slabs
     for start, own, stop in slabs(blocks, slab_bytes):
-        volume = fuse_blocks(frames, limits, blocks.part(start, stop), threads=threads, backend=backend)
+        volume = fuse_blocks(frames, limits, blocks.part(start, stop), backend=backend)
         found, corners, ends = cell_surface(volume, min_weight, own - start)
         points, tints = edge_vertices(volume, found, ends)
         del volume

@@ -32,7 +32,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.image_arrays import area_downscale, mask_downscale
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import ProtocolError
-from gs2d.meshing.agreement import VOTE, Agreement, agree, corrected
+from gs2d.meshing.agreement import VOTE, agree, corrected
 from gs2d.meshing.evidence import areas
 from gs2d.meshing.raycast import cast_camera, outlines
 from gs2d.meshing.simplify import simplify
@@ -306,18 +306,19 @@ def surface_colors(
     """
     origin = mesh.vertices.astype(np.float64).mean(axis=0)
     points = _Points.of(mesh, texels, origin)
-    compared = _Compared(points, texels, float(areas(mesh).sum()))
-    for image in images(COARSE):
-        compared.add(_Looked(mesh, image, origin))
-    compared.agree()
+    coarse = (_Looked(mesh, image, origin) for image in images(COARSE))
+    common, samples = _compared(points, texels, float(areas(mesh).sum()), coarse)
+    agreement = agree(samples)
     chooser = _Chooser(points, best, threads or os.cpu_count() or 1)
     for number, image in enumerate(images(1)):
         looked = _Looked(mesh, image, origin)
-        compared.correct(looked, number)
+        rows = np.flatnonzero(samples[number][:, 3])
+        gain = agreement.gains[number]
+        looked.correct(common.positions[rows], samples[number][rows], agreement.colors[rows], gain)
         chooser.add(looked)
     colors, seen = chooser.colors()
     if not seen.any():
-        raise ProtocolError(f"none of {chooser.count} photographs sees the mesh; does it belong to this capture?")
+        raise ProtocolError(f"none of {len(samples)} photographs sees the mesh; does it belong to this capture?")
     return colors, seen
 
 
@@ -347,42 +348,28 @@ class _Points:
         return _Points(self.positions[rows], self.normals[rows], self.heights[rows])
 
 
-class _Compared:
-    """Colours of surface points in all images, and their consensus."""
+def _compared(
+    points: _Points, texels: Texels, area: float, images: Iterable[_Looked]
+) -> tuple[_Points, list[np.ndarray]]:
+    """Return points of the comparison, and their colours and votes in each image, [P, 4] uint8.
 
-    def __init__(self, points: _Points, texels: Texels, area: float) -> None:
-        row, column = np.divmod(texels.index, texels.size)
-        self._points = points.subset(np.flatnonzero((row % _STRIDE == 0) & (column % _STRIDE == 0)))
-        self._area = area / max(len(self._points.positions), 1)  # world units^2 per point
-        self._samples: list[np.ndarray] = []  # [P, 4] uint8: colour and vote, later the weight
-        self._agreement: Agreement | None = None
-
-    def add(self, looked: _Looked) -> None:
-        """Look the points up in an image; every second point is dropped if the table becomes too large."""
-        while (len(self._samples) + 1) * len(self._points.positions) * 4 > TABLE_BYTES:
-            self._points = self._points.subset(slice(None, None, 2))
-            self._samples = [samples[::2].copy() for samples in self._samples]
-        samples = np.zeros((len(self._points.positions), 4), np.uint8)
-        seen = looked.see(self._points, np.zeros(len(samples), np.float32))
-        resolved = np.minimum(seen.density * self._area, 1)  # pixels per point
-        samples[seen.rows, :3] = np.rint(seen.colors)
-        samples[seen.rows, 3] = np.ceil(VOTE * seen.clear * seen.cosine * resolved)
-        self._samples.append(samples)
-
-    def agree(self) -> None:
-        """Estimate the consensus."""
-        self._agreement = agree(self._samples)
-
-    def correct(self, looked: _Looked, number: int) -> None:
-        """Correct the image with this index."""
-        assert self._agreement is not None
-        rows = np.flatnonzero(self._samples[number][:, 3])
-        looked.correct(
-            self._points.positions[rows],
-            self._samples[number][rows],
-            self._agreement.colors[rows],
-            self._agreement.gains[number],
-        )
+    ``area`` is that of the mesh, world units^2. Every second point is dropped if the table becomes too large.
+    """
+    row, column = np.divmod(texels.index, texels.size)
+    points = points.subset(np.flatnonzero((row % _STRIDE == 0) & (column % _STRIDE == 0)))
+    area /= max(len(points.positions), 1)  # of a point
+    table: list[np.ndarray] = []
+    for image in images:
+        while (len(table) + 1) * len(points.positions) * 4 > TABLE_BYTES:
+            points = points.subset(slice(None, None, 2))
+            table = [samples[::2].copy() for samples in table]
+        samples = np.zeros((len(points.positions), 4), np.uint8)
+        rows, density, clear, cosine, colors = image.see(points, np.zeros(len(samples), np.float32))
+        resolved = np.minimum(density * area, 1)  # pixels per point
+        samples[rows, :3] = np.rint(colors)
+        samples[rows, 3] = np.ceil(VOTE * clear * cosine * resolved)
+        table.append(samples)
+    return points, table
 
 
 class _Chooser:
@@ -390,7 +377,6 @@ class _Chooser:
 
     def __init__(self, points: _Points, best: int, threads: int) -> None:
         self._points, self._threads = points, threads
-        self.count = 0
         n = len(points.positions)
         self._parts = [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
         self._scores = np.zeros((n, best + 1), np.float32)
@@ -399,17 +385,16 @@ class _Chooser:
 
     def add(self, looked: _Looked) -> None:
         """Replace the lowest score of every texel for which this image is better."""
-        self.count += 1
         with ThreadPoolExecutor(self._threads) as pool:
             for _ in pool.map(lambda part: self._choose(looked, part), self._parts):
                 pass
 
     def _choose(self, looked: _Looked, part: slice) -> None:
         scores, least = self._scores[part], self._least[part]
-        seen = looked.see(self._points.subset(part), least)
-        worst = scores[seen.rows].argmin(axis=1)
-        scores[seen.rows, worst], self._colors[part][seen.rows, worst] = seen.density * seen.clear, np.rint(seen.colors)
-        least[seen.rows] = scores[seen.rows].min(axis=1)
+        rows, density, clear, _, colors = looked.see(self._points.subset(part), least)
+        worst = scores[rows].argmin(axis=1)
+        scores[rows, worst], self._colors[part][rows, worst] = density * clear, np.rint(colors)
+        least[rows] = scores[rows].min(axis=1)
 
     def colors(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean colours [T, 3] uint8 of the texels, and which of them any image sees [T]."""
@@ -420,28 +405,6 @@ class _Chooser:
             mean = np.einsum("tk,tkc->tc", weights, self._colors[part].astype(np.float32)) / total[:, None]
             colors[part] = np.rint(mean)
         return colors, self._scores.max(axis=1) > 0
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Points that an image sees.
-
-    Attributes
-    ----------
-    rows : ndarray [m] int64
-    density : ndarray [m]
-        q, pixels per unit of surface.
-    clear : ndarray [m]
-        b, factor for the distance from an outline.
-    cosine : ndarray [m]
-    colors : ndarray [m, 3]
-    """
-
-    rows: np.ndarray
-    density: np.ndarray
-    clear: np.ndarray
-    cosine: np.ndarray
-    colors: np.ndarray
 
 
 class _Looked:
@@ -469,8 +432,19 @@ class _Looked:
         column = ((np.arange(width) + 0.5) * (weights.shape[1] / width)).astype(np.int64)[None]
         self._clear *= weights[row, column]
 
-    def see(self, points: _Points, least: np.ndarray) -> _Seen:
-        """Return the visible points with a score above ``least`` [n]."""
+    def see(self, points: _Points, least: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the visible points with a score above ``least`` [n].
+
+        Returns
+        -------
+        rows : ndarray [m] int64
+        density : ndarray [m]
+            q, pixels per unit of surface.
+        clear : ndarray [m]
+            b, factor for the distance from an outline.
+        cosine : ndarray [m]
+        colors : ndarray [m, 3]
+        """
         facing = points.normals @ self._center - points.heights
         z = points.positions @ self._rotation[2] + self._shift[2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -492,7 +466,7 @@ class _Looked:
         tolerance = z / small.fx * (1 + 2 / np.maximum(cosine, GRAZING))
         seen = (cosine > GRAZING) & (np.abs(z - self._depth.reshape(-1)[pixel]) <= tolerance)
         rows = rows[seen]
-        return _Seen(rows, density[rows], clear[seen], cosine[seen], bilinear(self._image, x[seen], y[seen]))
+        return rows, density[rows], clear[seen], cosine[seen], bilinear(self._image, x[seen], y[seen])
 
     def _project(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x and y in px, and the depth."""

@@ -9,16 +9,16 @@ of a thin plate do not interfere.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from gs2d.errors import ProtocolError
-from gs2d.kernels.library import Library, load
+from gs2d.kernels.library import load
 from gs2d.kernels.tsdf import FusionOnDevice, arguments_of, fuse_on_cpu, fuse_on_gpu, mark_on_cpu
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.fusion_bounds import FusionBounds, backproject
@@ -167,35 +167,6 @@ def fusion_backend(backend: str | Backend) -> Backend:
     return get_backend("cpu") if chosen.fusion() is None else chosen
 
 
-def integrator(
-    volumes: Sequence[Volume], backend: str | Backend, threads: int | None = None
-) -> AbstractContextManager[Add]:
-    """Return a context that yields a function which adds a view; afterwards the volumes hold the result.
-
-    Parameters
-    ----------
-    volumes : sequence of Volume
-    backend : str or Backend
-        "auto", "cpu", "cuda", "reference", or a registered name.
-    threads : int, optional
-        Default: all cores. The result does not depend on it.
-
-    Raises
-    ------
-    BackendError
-        If the backend is unknown or cannot run here.
-    """
-    device = fusion_backend(backend).fusion()
-    return add_natively(volumes, threads) if device is None else add_on_gpu(volumes, device)
-
-
-def native_library(threads: int | None) -> Library:
-    """Return the native library, set to a number of threads (default: all cores)."""
-    library = load()
-    library.use_threads(threads or os.cpu_count() or 1)
-    return library
-
-
 class _Grid:
     """The blocks of a volume."""
 
@@ -221,44 +192,42 @@ class _Grid:
 
 
 @contextmanager
-def add_natively(volumes: Sequence[Volume], threads: int | None) -> Iterator[Add]:
-    """Add views with the native CPU library."""
-    grids = [_Grid(volume) for volume in volumes if len(volume.keys)]
+def integrator(volumes: Sequence[Volume], device: FusionOnDevice | None) -> Iterator[Add]:
+    """Yield a function that adds a view to volumes, which hold the result at the end.
 
-    def add(view: DepthSampler) -> None:
-        library = native_library(threads)
-        for grid in grids:
-            volume = grid.volume
-            arrays = _view_arrays(view, colored=volume.color is not None) | grid.change(view) | _volume_arrays(volume)
-            fuse_on_cpu(library, arguments_of((view.height, view.width), volume.limits.truncation, arrays))
+    Parameters
+    ----------
+    volumes : sequence of Volume
+    device : FusionOnDevice or None
+        A GPU, where the volumes stay until the end; None: the native CPU library, with its number of threads, on which
+        the result does not depend.
+    """
 
-    yield add
-
-
-@contextmanager
-def add_on_gpu(volumes: Sequence[Volume], gpu: FusionOnDevice) -> Iterator[Add]:
-    """Add views on a GPU: the volumes stay there until the end; each view and its blocks are copied there."""
-
-    def to_device(arrays: dict[str, np.ndarray | None]) -> dict[str, torch.Tensor | None]:
-        return {name: None if a is None else torch.from_numpy(a).to(gpu.device) for name, a in arrays.items()}
+    def placed(arrays: dict[str, np.ndarray | None]) -> dict[str, Any]:
+        if device is None:
+            return arrays
+        return {name: None if a is None else torch.from_numpy(a).to(device.device) for name, a in arrays.items()}
 
     grids = [_Grid(volume) for volume in volumes if len(volume.keys)]
-    held = [to_device(_volume_arrays(grid.volume)) for grid in grids]
+    held = [placed(_volume_arrays(grid.volume)) for grid in grids]
+    colored = any(grid.volume.color is not None for grid in grids)
 
     def add(view: DepthSampler) -> None:
-        colored = any(grid.volume.color is not None for grid in grids)
-        image = to_device(_view_arrays(view, colored=colored))
+        image = placed(_view_arrays(view, colored=colored))
         for grid, volume in zip(grids, held, strict=True):
-            blocks = to_device(grid.change(view))
-            size, truncation = (view.height, view.width), grid.volume.limits.truncation
-            fuse_on_gpu(gpu.launcher, arguments_of(size, truncation, image | blocks | volume))
+            arrays = image | placed(grid.change(view)) | volume
+            arguments = arguments_of((view.height, view.width), grid.volume.limits.truncation, arrays)
+            if device is None:
+                fuse_on_cpu(load(), arguments)
+            else:
+                fuse_on_gpu(device.launcher, arguments)
 
     yield add
-    for grid, tensors in zip(grids, held, strict=True):
-        for name, array in _volume_arrays(grid.volume).items():
-            tensor = tensors[name]
-            if array is not None and tensor is not None:
-                array[...] = tensor.cpu().numpy()
+    if device is not None:
+        for grid, tensors in zip(grids, held, strict=True):
+            for name, array in _volume_arrays(grid.volume).items():
+                if array is not None:
+                    array[...] = tensors[name].cpu().numpy()
 
 
 def _view_arrays(view: DepthSampler, *, colored: bool) -> dict[str, np.ndarray | None]:
@@ -306,19 +275,15 @@ def find_blocks(
     limits: FusionBounds,
     *,
     max_bytes: int = 4 << 30,
-    threads: int | None = None,
 ) -> VolumeBlocks:
     """Find the blocks to fuse.
 
     Parameters
     ----------
     frames : iterable of DepthMap
-        Read one at a time: a sequence or a ``Spool``, not a generator.
     limits : FusionBounds
     max_bytes : int
         Limit of the volume.
-    threads : int, optional
-        Default: all cores. The result does not depend on it.
 
     Raises
     ------
@@ -326,8 +291,6 @@ def find_blocks(
         If the blocks near the surface need more than ``max_bytes`` (the message suggests a voxel), the truncation
         exceeds the box, or no depth is inside the limits.
     """
-    if iter(frames) is frames:
-        raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(limits)
     dims = block_grid(limits)
     budget = Budget(limits, max_bytes)
@@ -335,7 +298,7 @@ def find_blocks(
     colored = False
     for item in frames:
         colored = colored or item.color is not None
-        keys = merged(keys, touched_blocks(item, limits, dims, threads))
+        keys = merged(keys, touched_blocks(item, limits, dims))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
@@ -348,12 +311,11 @@ def fuse_blocks(
     limits: FusionBounds,
     blocks: VolumeBlocks,
     *,
-    threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Volume:
     """Fuse depth maps into these blocks; ``backend`` is "cuda", or the native CPU library for every other name."""
     volume = invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored)
-    add_all([volume], frames, lambda item: make_sampler(item, limits), threads=threads, backend=backend)
+    add_all([volume], frames, lambda item: make_sampler(item, limits), backend=backend)
     return volume
 
 
@@ -362,12 +324,11 @@ def add_all(
     frames: Iterable[DepthMap],
     prepare: Callable[[DepthMap], DepthSampler],
     *,
-    threads: int | None,
     backend: str | Backend,
 ) -> None:
     """Add depth maps to volumes, in place. Views that see no volume are skipped, since preparing a view is slow."""
     boxes = [box_corners(volume) for volume in volumes if len(volume.keys)]
-    with integrator(volumes, backend, threads) as add:
+    with integrator(volumes, fusion_backend(backend).fusion()) as add:
         for item in frames:
             if any(may_see(item.camera, box) for box in boxes):
                 add(prepare(item))
@@ -387,9 +348,7 @@ def _samples(item: DepthMap, depth: np.ndarray, limits: FusionBounds) -> tuple[i
     return max(1, int(np.ceil(width / half))), int(np.ceil(2 * limits.truncation / half)) + 1
 
 
-def touched_blocks(
-    item: DepthMap, limits: FusionBounds, dims: tuple[int, int, int], threads: int | None = None
-) -> np.ndarray:
+def touched_blocks(item: DepthMap, limits: FusionBounds, dims: tuple[int, int, int]) -> np.ndarray:
     """Return the sorted keys [K] of the blocks near the surface of one depth map.
 
     Each valid pixel is sampled along its ray from one truncation in front of the surface to one behind it, in steps of
@@ -410,7 +369,7 @@ def touched_blocks(
     start = (item.camera.center - limits.lower) / half  # in half blocks, as everything below
     end = 2 * np.asarray(dims)
     marks = np.zeros(padded, bool)
-    library = native_library(threads)
+    library = load()
     for dx in shifts:
         for dy in shifts:
             ends = backproject(item.camera, np.ones(len(rows)), rows + dy, columns + dx)

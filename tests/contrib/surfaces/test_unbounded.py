@@ -139,7 +139,7 @@ def test_the_mesh_of_all_levels_does_not_depend_on_slabs(levels: int, slab_bytes
     maps = maps if colored else [replace(item, color=None) for item in maps]
     cascade = cascade_of(levels, depth_limit=6.0)  # some of the nine levels have no blocks
     whole = fused_levels(maps, cascade)
-    blocks = find_cascade_blocks(maps, cascade, threads=1)
+    blocks = find_cascade_blocks(maps, cascade)
     assert sum(part.nbytes for part in blocks) > 2 * slab_bytes  # several slabs
     parts = fused_levels(maps, cascade, slab_bytes=slab_bytes)
     assert len(whole.faces) > 1000

@@ -13,7 +13,7 @@ from depth_waves import waves
 from gs2d.kernels.tsdf import FusionOnDevice
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
 from gs2d.meshing.sampling import make_sampler
-from gs2d.meshing.tsdf_volume import Volume, add_natively, add_on_gpu, block_grid, invalid_volume, touched_blocks
+from gs2d.meshing.tsdf_volume import Volume, block_grid, integrator, invalid_volume, touched_blocks
 
 
 @pytest.mark.parametrize("colored", [True, False])
@@ -30,7 +30,7 @@ def test_the_kernel_leaves_the_field_of_the_cpu_in_every_bit(emulator: emulate.E
 
     found, expected = empty(), empty()
     gpu = FusionOnDevice(emulator, torch.device("cpu"))
-    with add_on_gpu([found], gpu) as add, add_natively([expected], 1) as add_too:
+    with integrator([found], gpu) as add, integrator([expected], None) as add_too:
         for view in views:
             add(make_sampler(view, limits))
             add_too(make_sampler(view, limits))

@@ -19,8 +19,8 @@ from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
 from gs2d.meshing.consistency import depth_noise
-from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool
-from gs2d.meshing.extract import Extraction, ExtractOptions, sampled
+from gs2d.meshing.depth_maps import DepthMap, RenderedView
+from gs2d.meshing.extract import Extraction, ExtractOptions, spooled
 from gs2d.meshing.fusion_bounds import (
     BOX_PERCENTILES,
     DEPTH_PERCENTILE,
@@ -214,11 +214,8 @@ def find_cascade_blocks(
     cascade: TsdfCascade,
     *,
     max_bytes: int = 4 << 30,
-    threads: int | None = None,
 ) -> tuple[VolumeBlocks, ...]:
     """Find the blocks of each level; parameters and errors as for ``find_blocks``, with a common limit of memory."""
-    if iter(frames) is frames:
-        raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(cascade.levels[0])
     block_grid(cascade.levels[0])  # refuses voxels that are too small
     budget = Budget(cascade.levels[0], max_bytes, side=2 * cascade.half, step=STEP)
@@ -226,7 +223,7 @@ def find_cascade_blocks(
     colored = False
     for item in frames:
         colored = colored or item.color is not None
-        for k, found in enumerate(_touched(item, cascade, threads)):
+        for k, found in enumerate(_touched(item, cascade)):
             keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
@@ -243,7 +240,6 @@ def _fuse_into(
     volumes: Sequence[Volume],
     frames: Iterable[DepthMap],
     cascade: TsdfCascade,
-    threads: int | None,
     backend: str | Backend,
 ) -> None:
     """Add all views to volumes of some levels."""
@@ -251,7 +247,7 @@ def _fuse_into(
     def prepare(item: DepthMap) -> DepthSampler:
         return make_sampler(item, cascade.levels[0], truncation=_truncations(item, cascade))
 
-    add_all(volumes, frames, prepare, threads=threads, backend=backend)
+    add_all(volumes, frames, prepare, backend=backend)
 
 
 def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
@@ -269,7 +265,7 @@ def _truncations(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
     return cascade.levels[0].truncation * np.exp2(np.minimum(level, len(cascade.levels) - 1))
 
 
-def _touched(item: DepthMap, cascade: TsdfCascade, threads: int | None) -> list[np.ndarray]:
+def _touched(item: DepthMap, cascade: TsdfCascade) -> list[np.ndarray]:
     """Return the keys of each level's own blocks near the surface of a depth map."""
     distance = _distances(item, cascade)
     first, last = cascade.hole
@@ -284,7 +280,7 @@ def _touched(item: DepthMap, cascade: TsdfCascade, threads: int | None) -> list[
         step = BLOCK * limits.voxel
         lower = (limits.lower[0] - step, limits.lower[1] - step, limits.lower[2] - step)
         dims = (cascade.dims[0] + 2,) * 3
-        keys = touched_blocks(part, replace(limits, lower=lower), dims, threads)
+        keys = touched_blocks(part, replace(limits, lower=lower), dims)
         blocks = np.stack(np.unravel_index(keys, dims), axis=1) - 1
         blocks = blocks[((blocks >= 0) & (blocks < cascade.dims[0])).all(axis=1)]
         if k:
@@ -353,7 +349,6 @@ def fused_cascade_surface(
     min_weight: float = 1.0,
     far_weight: float,
     slab_bytes: int = SLAB_BYTES,
-    threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Mesh:
     """Fuse depth maps into all levels, and extract the zero level set as one mesh.
@@ -371,7 +366,7 @@ def fused_cascade_surface(
         Smallest weight of known voxels in the innermost level, and in all others.
     slab_bytes : int
         See ``fused_surface``.
-    threads, backend
+    backend
         As for ``fuse_blocks``.
     """
     surface = CascadeSurface(cascade, [len(part.keys) for part in blocks], min_weight, far_weight)
@@ -380,7 +375,7 @@ def fused_cascade_surface(
             surface.add(_empty(part, cascade.levels[level]), level, 0, 0)
     for slabs_at_once in _batches(blocks, slab_bytes):
         volumes = [_empty(blocks[k].part(start, stop), cascade.levels[k]) for k, start, _, stop in slabs_at_once]
-        _fuse_into(volumes, frames, cascade, threads, backend)
+        _fuse_into(volumes, frames, cascade, backend)
         for (level, start, own, _), volume in zip(slabs_at_once, volumes, strict=True):
             surface.add(volume, level, start, own - start)
         volumes.clear()
@@ -561,7 +556,7 @@ def _join_triangles(nodes: _Nodes, cells: np.ndarray) -> np.ndarray:
 
 @register_mesh_method("unbounded", bounded=False)
 def extract_unbounded(
-    frames: Iterable[RenderedView] | Spool,
+    frames: Iterable[RenderedView],
     options: ExtractOptions = ExtractOptions(),  # noqa: B008 (frozen)
     *,
     threads: int | None = None,
@@ -585,29 +580,27 @@ def extract_unbounded(
         As ``extract``.
     """
     backend = fusion_backend(backend)
-    with Spool.of(frames) as spool:
-        samples = sampled(spool)
-        cascade = derive_cascade(samples, spool.cameras, **options.limits)
-        if options.truncation is None:
-            inner = cascade.levels[0]
-            # distant depths differ more, but their levels have wider truncations
-            noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
-            cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
-        del samples
-        trim()
-        blocks = find_cascade_blocks(spool, cascade, max_bytes=options.max_bytes, threads=threads)
-        count, volume_bytes = len(spool), sum(level.nbytes for level in blocks)
-        mesh = fused_cascade_surface(
-            spool,
-            cascade,
-            blocks,
-            min_weight=options.min_weight,
-            far_weight=min(FAR_VIEWS, count / 2),
-            slab_bytes=options.slab_bytes,
-            threads=threads,
-            backend=backend,
-        )
-        trim()
-        mesh = simplify(keep_components(mesh, keep=options.keep), error=options.error, cameras=spool.cameras)
+    spool, samples = spooled(frames, threads)
+    cascade = derive_cascade(samples, spool.cameras, **options.limits)
+    if options.truncation is None:
+        inner = cascade.levels[0]
+        # distant depths differ more, but their levels have wider truncations
+        noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
+        cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
+    del samples
+    trim()
+    blocks = find_cascade_blocks(spool, cascade, max_bytes=options.max_bytes)
+    count, volume_bytes = len(spool), sum(level.nbytes for level in blocks)
+    mesh = fused_cascade_surface(
+        spool,
+        cascade,
+        blocks,
+        min_weight=options.min_weight,
+        far_weight=min(FAR_VIEWS, count / 2),
+        slab_bytes=options.slab_bytes,
+        backend=backend,
+    )
+    trim()
+    mesh = simplify(keep_components(mesh, keep=options.keep), error=options.error, cameras=spool.cameras)
     limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
     return Extraction(mesh, limits, count, volume_bytes, len(cascade.levels), backend.name)
