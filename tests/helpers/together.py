@@ -23,7 +23,7 @@ from torch import Tensor
 from gs2d.config.presets import two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.quantities import EXPOSURE, POSES
-from gs2d.config.recipe import Recipe
+from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.processes import ProcessRank
@@ -102,11 +102,12 @@ def dropping() -> Recipe:
 
 
 def robust() -> Recipe:
-    """Return 15 iterations on a wall, with a dense start and floater removal."""
+    """Return 15 iterations on a wall, with a dense start, floater removal and a search for shiny surface."""
     made = scale_schedule(with_robustness(two_dgs()), 0.0005)
     start = DenseStart(side=48, min_angle=1.0)
     made = replace(made, dense_start=start, removal=Removal(every=5, decay=0.1))
-    return replace(made, stages=(replace(made.stages[0], densify=None),), sh_degree=1)
+    made = replace(made, stages=(replace(made.stages[0], densify=None),), sh_degree=1)
+    return made.with_loss(LossTerm("normal_smoothness", 0.4))
 
 
 ROOM = 90_000  # bytes per process for cached views

@@ -10,7 +10,7 @@ import pytest
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import RenderedView, depth_map
-from gs2d.meshing.evidence import areas, gather
+from gs2d.meshing.evidence import Evidence, areas, gather, large_components
 from gs2d.meshing.extract import ExtractOptions, extract
 from gs2d.meshing.fusion_bounds import backproject
 from surface_shapes import orbit, sphere_depth
@@ -119,3 +119,19 @@ def part_of_floor(frames: list[RenderedView]) -> float:
 
 def test_a_floor_with_noisy_depths_is_kept() -> None:
     assert part_of_floor(views_of_a_floor()) == pytest.approx(1, abs=0.1)
+
+
+def test_a_small_part_stays_if_about_as_many_views_see_it_as_the_rest() -> None:
+    def sheet(x: float, side: float) -> tuple[np.ndarray, np.ndarray]:
+        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]) * side + [x, 0, 0]
+        return corners, np.array([[0, 1, 2], [1, 3, 2]])
+
+    parts = [sheet(0, 10.0), sheet(20, 0.5), sheet(30, 0.5), sheet(40, 0.5)]
+    vertices = np.concatenate([corners for corners, _ in parts])
+    faces = np.concatenate([corner + 4 * k for k, (_, corner) in enumerate(parts)])
+    views = np.repeat([20, 12, 4, 12], 4)  # the last one covers few pixels
+    density = np.repeat([100.0, 1000.0, 1000.0, 10.0], 4)
+    evidence = Evidence(views.astype(np.int32), np.ones(16), np.zeros(16), density)
+    mesh, kept = large_components(Mesh(vertices, faces), evidence)
+    assert sorted(set(mesh.vertices[:, 0] // 10)) == [0, 1, 2]
+    assert sorted(set(kept.views)) == [12, 20]

@@ -8,8 +8,8 @@ The idea is that of Vu et al. 2012, "High accuracy and visibility-consistent den
 plus a membrane term on each step. kappa is the mean curvature, kappa_0 a smooth version of
 that of the start, and A the area of a vertex, s the size of a pixel on the
 surface, m the distance that the vertex has moved. Each step solves the Gauss-Newton system of the distances along the
-normals, so surface without texture follows its surroundings. In the end, shiny surface goes back to its start: there
-photographs agree on reflections, which lie elsewhere. Formulas: docs/math.md, "Mesh refinement".
+normals, so surface without texture follows its surroundings. So does shiny surface, where w is 0: there photographs
+agree on reflections, which lie elsewhere. Formulas: docs/math.md, "Mesh refinement".
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ LONGEST_STEP = 1.0  # px, of a vertex
 SOLVER_STEPS = 60  # iterations of the solver in a step, at most
 TOLERANCE = 1e-3  # relative residual at which it stops
 MATT, SHINY = 0.1, 0.2
-"""Share of brightness in the differences of photographs, see ``brightness_share``: up to MATT, a vertex keeps its whole
-move, from SHINY on none. Its median is 0.08 on stone, 0.12 on boxes and in a room, 0.5 on metal."""
+"""Share of brightness in the differences of photographs, see ``brightness_share``: up to MATT, photographs move a
+vertex, from SHINY on they do not. Its median is 0.08 on stone, 0.12 on boxes and in a room, 0.5 on metal."""
 RARELY, OFTEN = 0.1, 0.3
 """Part of the pixels of a vertex that can be compared, away from outlines and seen by the neighbour: up to RARELY, a
 vertex keeps nothing of its move, from OFTEN on all. Rods, wires and leaves have few of them."""
@@ -115,6 +115,8 @@ class _Moving:
     faces : ndarray [F, 3] int32
     size : ndarray [P] float64, world units
         Size of a full pixel on the surface.
+    matt : ndarray [P] float64, from 0 to 1
+        Factor of w: 0 on shiny surface.
     kept : ndarray [P] float64, from 0 to 1
         Share of its move that a vertex keeps in the end.
     """
@@ -123,6 +125,7 @@ class _Moving:
     start: np.ndarray
     faces: np.ndarray
     size: np.ndarray
+    matt: np.ndarray
     kept: np.ndarray
 
     def normals(self) -> np.ndarray:
@@ -131,9 +134,9 @@ class _Moving:
 
     def split(self, limit: np.ndarray) -> _Moving:
         """Halve edges longer than ``limit`` [P]."""
-        values = np.concatenate([self.start, self.size[:, None], self.kept[:, None]], axis=1)
+        values = np.column_stack([self.start, self.size, self.matt, self.kept])
         vertices, faces, values = split_edges(self.vertices, self.faces, limit, values)
-        return _Moving(vertices, values[:, :3], faces, values[:, 3], values[:, 4])
+        return _Moving(vertices, values[:, :3], faces, *values[:, 3:].T)
 
     def settled(self) -> np.ndarray:
         """Return the final vertices [P, 3]."""
@@ -205,7 +208,8 @@ class Refinement:
             return self._mesh
         density[density == 0] = np.median(density[density > 0])
         neighbours = choose_neighbours(mesh, self._cameras, settings, self._library)
-        now = _Moving(mesh.vertices, mesh.vertices, mesh.faces, 1 / np.sqrt(density), np.ones(len(density)))
+        one = np.ones(len(density))
+        now = _Moving(mesh.vertices, mesh.vertices, mesh.faces, 1 / np.sqrt(density), one, one)
         self._done = 0
         for factor in self._factors:
             # of an equilateral face; halves of an edge are shorter by up to 2
@@ -236,7 +240,7 @@ class Refinement:
     def _at_size(
         self, now: _Moving, factor: int, neighbours: Sequence[Sequence[int]], on_work: Callable[[int], None]
     ) -> _Moving:
-        """Take the steps at one size of the photographs; at the first, find out which moves are kept."""
+        """Take the steps at one size of the photographs; at the first, find out which vertices can be believed."""
         cameras = [camera.downscaled(factor) for camera in self._cameras]
         photographs = self._cached(lambda index: self._photographs(index, factor), cameras)
         curvature = Curvature.of(now.vertices, now.faces, now.normals())
@@ -250,7 +254,8 @@ class Refinement:
 
         surface = Surface(now.vertices, now.faces, now.normals())
         if factor == self._factors[0]:
-            now = replace(now, kept=self._kept(surface, views(surface), curvature))
+            matt, kept = self._believed(surface, views(surface), curvature)
+            now = replace(now, matt=matt, kept=kept)
         for _ in range(self._settings.steps):
             surface = Surface(now.vertices, now.faces, now.normals())
             now = self._moved(now, factor, surface.normals, self._pulled(surface, views(surface)), bend)
@@ -287,17 +292,17 @@ class Refinement:
             gather_vertices(surface, image.camera, drawn.face, by_pixel, pull, match, self._library)
         return pull
 
-    def _kept(self, surface: Surface, views: Iterable[ComparedView], curvature: Curvature) -> np.ndarray:
-        """Return the share of its move that each vertex keeps [P]: 1 on matt surface that photographs can compare."""
+    def _believed(
+        self, surface: Surface, views: Iterable[ComparedView], curvature: Curvature
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return how matt the surface is at each vertex [P], and the share of its move that it keeps [P]."""
         settings, faces = self._settings, surface.faces
         sums = np.zeros((4, len(faces)))  # brightness and its weights, pixels that were compared and all pixels
         for image, drawn, neighbours in views:
             at = drawn.face >= 0
-            for other, depth in neighbours:
-                share, weight = brightness_share(image, other, drawn.depth, depth, settings.match, self._library)
-                compared = ~np.isnan(share)
-                for total, values in zip(sums, (np.nan_to_num(share) * weight, weight, compared, at), strict=True):
-                    total += np.bincount(drawn.face[at], values[at], len(faces))
+            share, weight, compared = brightness_share(image, drawn.depth, neighbours, settings.match, self._library)
+            for total, values in zip(sums, (share * weight, weight, compared, at), strict=True):
+                total += np.bincount(drawn.face[at], values[at], len(faces))
         bright, textured, compared, drawn_pixels = (
             curvature.spread(np.bincount(faces.ravel(), np.repeat(total, 3), len(surface.vertices)), KEPT_RINGS)
             for total in sums
@@ -305,7 +310,7 @@ class Refinement:
         shine = bright / np.maximum(textured, TINY)
         often = compared / np.maximum(drawn_pixels, TINY)
         matt = np.clip((SHINY - shine) / (SHINY - MATT), 0.0, 1.0)
-        return matt * np.clip((often - RARELY) / (OFTEN - RARELY), 0.0, 1.0)
+        return matt, np.clip((often - RARELY) / (OFTEN - RARELY), 0.0, 1.0)
 
     def _moved(self, now: _Moving, factor: int, normals: np.ndarray, pull: Pull, bend: np.ndarray) -> _Moving:
         """Take one Gauss-Newton step; ``bend`` [P] is the curvature to keep."""
@@ -315,8 +320,10 @@ class Refinement:
         hold = TETHER * curvature.areas / size**4
         away = ((now.vertices - now.start) * normals).sum(axis=1)
         joint = diags_array(np.sqrt(MEMBRANE) / size)
-        matrix = stiff @ curvature.change + joint @ curvature.graph @ joint + diags_array(pull.curvature + hold)
-        right = -(pull.gradient + stiff @ (curvature.values - bend) + hold * away)
+        matrix = (
+            stiff @ curvature.change + joint @ curvature.graph @ joint + diags_array(now.matt * pull.curvature + hold)
+        )
+        right = -(now.matt * pull.gradient + stiff @ (curvature.values - bend) + hold * away)
         step = solve(csr_array(matrix), right, steps=SOLVER_STEPS, tolerance=TOLERANCE)
         longest = LONGEST_STEP * size
         return replace(now, vertices=now.vertices + normals * np.clip(step, -longest, longest)[:, None])

@@ -14,6 +14,7 @@ docs/math.md, "Mesh refinement"; code: ``kernels/cpu/refine.cpp``.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +38,9 @@ from gs2d.meshing.raycast import NEAR, outlines
 
 OUTLINE = 2  # px on both sides of an outline that are ignored
 ENOUGH = 0.5  # fraction of a window that must be visible in both images
+SPAN = 0.03  # of the width, radius of the windows in which neighbours are compared by brightness
+FAINT = 0.02  # mean weight there, below which a neighbour says nothing
+TINY = 1e-12
 DARK = 0.02  # grey value below which the brightness of two images is not compared
 
 
@@ -219,28 +223,61 @@ def match_views(
 
 def brightness_share(
     view: GreyImage,
+    depth: np.ndarray,
+    neighbours: Sequence[tuple[GreyImage, np.ndarray]],
+    settings: MatchSettings,
+    library: Library,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which share of the difference between an image and its neighbours is brightness.
+
+    Around each pixel, d is the difference of the mean grey values after one gain for the whole image, and v the sum of
+    both variances. The share d^2 / (d^2 + v) is small on matt surfaces. Where it is large, brightness depends on the
+    direction of view: a reflection, whose texture is not on the surface. Of the means over ``SPAN``, the lower median
+    over the neighbours counts, because people who walk by are brighter or darker in some of them only.
+
+    Parameters
+    ----------
+    view : GreyImage
+    depth : ndarray [H, W] world units
+        Depth of the surface; 0 without one.
+    neighbours : sequence of (GreyImage, ndarray)
+        Other images, and the depth of the surface in them.
+    settings : MatchSettings
+    library : Library
+
+    Returns
+    -------
+    share, weight, compared : ndarray [H, W] float64
+        The weight is that of texture in :func:`match_views`, 0 where the images cannot be compared; ``compared`` is the
+        part of the neighbours that can be.
+    """
+    side = 2 * round(SPAN * depth.shape[1]) + 1
+    shares, weights, compared = [], [], np.zeros(depth.shape)
+    for other, other_depth in neighbours:
+        share, weight = _share(view, other, depth, other_depth, settings, library)
+        compared += weight > 0
+        mean_weight = uniform_filter(weight, side)
+        mean = uniform_filter(share * weight, side) / np.maximum(mean_weight, TINY)
+        shares.append(np.where(mean_weight > FAINT, mean, np.inf))
+        weights.append(mean_weight)
+    if not shares:
+        return compared, compared, compared
+    order = np.argsort(shares, axis=0)
+    known = np.isfinite(shares).sum(axis=0)
+    middle = np.take_along_axis(order, np.maximum(known - 1, 0)[None] // 2, axis=0)
+    share, weight = (np.take_along_axis(np.stack(values), middle, axis=0)[0] for values in (shares, weights))
+    return np.where(known > 0, share, 0.0), np.where(known > 0, weight, 0.0), compared / len(shares)
+
+
+def _share(
+    view: GreyImage,
     other: GreyImage,
     depth: np.ndarray,
     other_depth: np.ndarray,
     settings: MatchSettings,
     library: Library,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which share of the difference between two images is brightness, and the weight of each pixel.
-
-    Around each pixel, d is the difference of the mean grey values after one gain for the whole image, and v the sum of
-    both variances. The share d^2 / (d^2 + v) is small on matt surfaces. Where it is large, brightness depends on the
-    direction of view: a reflection, whose texture is not on the surface.
-
-    Parameters
-    ----------
-    view, other, depth, other_depth, settings, library
-        As of :func:`match_views`.
-
-    Returns
-    -------
-    share, weight : ndarray [H, W] float64
-        Where the images cannot be compared, NaN and 0. The weight is that of texture in :func:`match_views`.
-    """
+    """Return the share of brightness [H, W] of one pair and its weight, 0 where they cannot be compared."""
     into = Pull.zeros(depth.shape, f"f{library.dtype.itemsize}")
     planes = match_views(view, other, depth, other_depth, settings, into, library)
     visible = planes[VISIBLE] > 0
@@ -255,10 +292,9 @@ def brightness_share(
     var_a = np.maximum(aa / n - mean_a**2, 0.0)
     var_b = np.maximum(bb / n - mean_b**2, 0.0) * gain**2
     weaker = np.minimum(var_a, var_b)
-    weight = np.where(enough, weaker / (weaker + settings.texture), 0.0)
     brighter = (mean_a - gain * mean_b) ** 2
-    share = brighter / np.maximum(brighter + var_a + var_b, 1e-12)
-    return np.where(enough, share, np.nan), weight
+    share = brighter / np.maximum(brighter + var_a + var_b, TINY)
+    return share, np.where(enough, np.maximum(weaker / (weaker + settings.texture), TINY), 0.0)
 
 
 def gather_vertices(

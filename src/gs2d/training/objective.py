@@ -214,7 +214,7 @@ class FullRender:
             index=index,
             depth_kind=self.protocol.depth,
             silhouette=target.silhouette,
-            flatness=target.flatness,
+            flatness=state.bare(index, target.flatness),
             target_mean=target.mean,
         )
         resolved = self.protocol.resolve(stage.losses)

@@ -23,7 +23,6 @@ import torch
 from torch import Tensor
 
 from gs2d.core.processes import ProcessRank
-from gs2d.core.splats import Splats
 from gs2d.errors import RunError
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
@@ -137,9 +136,9 @@ class OneProcess:
         """Return where a mask is True in any process."""
         return mask
 
-    def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
-        """Return ``judge(splats, known)``, uint8 [N], as computed by process 0; ``known`` is bool [N]."""
-        return judge(splats, known)
+    def decide(self, judge: Callable[[], Tensor], shape: tuple[int, ...], device: torch.device | str) -> Tensor:
+        """Return what ``judge`` returns in process 0: uint8 of a shape, on a device."""
+        return judge()
 
 
 ONE_PROCESS = OneProcess()
@@ -325,10 +324,9 @@ class ManyProcesses(OneProcess):
         """Return where a mask is True in any process."""
         return self.sum(mask.to(torch.int32)) > 0
 
-    def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
+    def decide(self, judge: Callable[[], Tensor], shape: tuple[int, ...], device: torch.device | str) -> Tensor:
         """Return the result of ``judge`` in process 0."""
-        nothing = torch.empty(len(splats), dtype=torch.uint8, device=splats.device)
-        found = judge(splats, known) if self.leads else nothing
+        found = judge() if self.leads else torch.empty(shape, dtype=torch.uint8, device=device)
         with self.contact():
             self._group.broadcast(found, src=0)
         return found
@@ -346,6 +344,8 @@ def _tensors(state: TrainState) -> Iterator[Tensor]:
     for rows in state.learned.values():
         yield rows.values
         yield rows.square
+    if state.shine is not None:
+        yield state.shine
 
 
 def _checksum(tensor: Tensor) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gs2d.core.checks import check_shapes
@@ -65,6 +66,8 @@ class TrainState:
         Remaining training views of this epoch; the last entry comes next.
     learned : dict of name to LearnedRows
         Learned quantities of images and cameras (``gs2d.training.learned``).
+    shine : Tensor [V, S, S] uint8, or None
+        How shiny the surface is in cells of the training views (``training.robust.shine``).
     processes : list of (stage, step, count)
         Number of processes from a stage and step on; empty for one process throughout.
     """
@@ -80,6 +83,14 @@ class TrainState:
     queue: list[int] = field(default_factory=list)
     learned: dict[str, LearnedRows] = field(default_factory=dict)
     processes: list[tuple[int, int, int]] = field(default_factory=list)
+    shine: Tensor | None = None
+
+    def bare(self, index: int, flatness: Tensor | None) -> Tensor | None:
+        """Return where training view ``index`` has no texture to trust, [H, W] uint8: flat or shiny pixels."""
+        if flatness is None or self.shine is None:
+            return flatness
+        shine = F.interpolate(self.shine[index][None, None].float(), flatness.shape, mode="bilinear")
+        return torch.maximum(flatness, shine[0, 0].to(torch.uint8))
 
     def trained_by(self, count: int) -> None:
         """Record the number of processes that train from here on, because the result depends on it."""
@@ -112,6 +123,7 @@ class TrainState:
             "generator": self.generator.get_state(),
             "learned": {name: rows.state_dict() for name, rows in self.learned.items()},
             "processes": [list(since) for since in self.processes],
+            "shine": None if self.shine is None else _copy(self.shine),
         }
 
     @classmethod
@@ -130,7 +142,7 @@ class TrainState:
             splats = Splats(**{name: data["splats"][name].clone() for name in ATTRIBUTES})
             generator = torch.Generator()
             generator.set_state(data["generator"])
-            statistics = data["statistics"]
+            statistics, shine = data["statistics"], data["shine"]
             state = cls(
                 splats,
                 generator,
@@ -146,6 +158,7 @@ class TrainState:
                 [int(index) for index in data["queue"]],
                 {name: LearnedRows.from_state_dict(rows) for name, rows in data["learned"].items()},
                 [(int(stage), int(step), int(count)) for stage, step, count in data["processes"]],
+                None if shine is None else shine.clone(),
             )
             state.check()
             numbers = dict(state.splats.items()) | {name: rows.values for name, rows in state.learned.items()}
@@ -168,6 +181,8 @@ class TrainState:
         self.groups = {name: mask.to(device) for name, mask in self.groups.items()}
         if self.statistics is not None:
             self.statistics = {k: v.to(device) for k, v in self.statistics.items()}
+        if self.shine is not None:
+            self.shine = self.shine.to(device)
 
     def check(self) -> None:
         """Check that all tensors have the same N and the expected types, and that counts are valid.

@@ -173,6 +173,7 @@ class Trainer:
         self._whole_steps: WholeSteps | None = None  # also of the current stage
         self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
         needs = {need for _, loss in self._losses for need in loss.needs}
+        self._needs_flatness = "flatness" in needs
         needs |= {"silhouette"} if is_opaque(self.recipe) or self.learned.changes_color else set()
         self._targets: TargetSource = make_targets(
             scene, protocol, self.backend, self.state.splats, needs, options.target_bytes
@@ -271,6 +272,8 @@ class Trainer:
         )
         for number in iterations:
             happened += self._robust.remove(self.state, stage, number)
+            if self._needs_flatness:
+                self._robust.find_shine(self.state, stage, number)
         state.step = iteration
         if changes_rows:
             together.check(state)

@@ -67,7 +67,7 @@ class WholeSteps:
             settings=self._settings_at(iteration, opaque=opaque),
             photograph=photograph.image,
             mask=photograph.mask,
-            flatness=photograph.flatness,
+            flatness=state.bare(index, photograph.flatness),
             valid=photograph.valid,
             background=whole.protocol.background,
             losses=losses,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -17,6 +17,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
+from gs2d.kernels.library import optional_library
+from gs2d.meshing.warped_ncc import GreyImage
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
@@ -24,6 +26,7 @@ from gs2d.training.learned.appearance import shown
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.parallel import ONE_PROCESS, OneProcess
+from gs2d.training.robust import shine
 from gs2d.training.robust.backdrop import in_color
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
 from gs2d.training.robust.opaque import is_opaque
@@ -100,6 +103,7 @@ class Robustness:
         self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
         self._images: Sequence[SmallView] = ()
+        self._neighbours: Sequence[Sequence[int]] = ()
         self._sweep: Sweep | None = None  # kept until the first splats are fitted
         self.lacks = ""
         if (recipe.dense_start is None and recipe.removal is None) or not processes.leads:
@@ -120,7 +124,7 @@ class Robustness:
         self._sweep = sweep if start is not None and start.fit else None
         if recipe.removal is not None:
             self._free = FreeSpaceMaps(sweep, spilled=scene.ahead > 0)
-            self._images = sweep.views
+            self._images, self._neighbours = sweep.views, sweep.neighbours
 
     @property
     def starts_densely(self) -> bool:
@@ -150,9 +154,7 @@ class Robustness:
             self._limit_scales(state)
         nobody = torch.zeros(state.splats.means.shape[0], dtype=torch.bool, device=state.splats.device)
         known = nobody if ends_part(self._recipe, stage, iteration) else state.groups.get(MISSED, nobody)
-        verdict = self._processes.decide(
-            lambda splats, spared: self._tried(state, stage, iteration, splats, spared), state.splats, known
-        )
+        verdict = self._decide(lambda: self._tried(state, stage, iteration, known), known)
         guilty = verdict == REMOVED
         state.groups[MISSED] = known | (verdict == NEEDED)
         removed = int(guilty.sum())
@@ -171,10 +173,33 @@ class Robustness:
         cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
         most = largest_log_scales(state.splats, cameras)
         large = (state.splats.log_scales > most).any(dim=1)
-        shrinks = self._processes.decide(self._are_shown, state.splats, large).bool()
+        shrinks = self._decide(lambda: self._are_shown(state.splats, large), large).bool()
         scales = state.splats.log_scales
         limits = torch.where(shrinks[:, None], most, most + math.log(LARGEST_ANYWHERE / LARGEST))
         self._backend.assign(scales, torch.minimum(scales, limits))
+
+    def _decide(self, judge: Callable[[], Tensor], like: Tensor) -> Tensor:
+        """Return what ``judge`` returns in process 0, uint8 of the shape and on the device of ``like``."""
+        return self._processes.decide(judge, tuple(like.shape), like.device)
+
+    def find_shine(self, state: TrainState, stage: Stage, iteration: int) -> None:
+        """Find out where photographs show shiny surface, if due; without the native library they count as matt."""
+        if self._recipe.removal is None or not shine.is_due(stage, iteration):
+            return
+        found = torch.zeros((len(self.scene.train), shine.CELLS, shine.CELLS), dtype=torch.uint8)
+        state.shine = self._decide(partial(self._shine, state, found), found.to(state.splats.device))
+
+    def _shine(self, state: TrainState, matt: Tensor) -> Tensor:
+        library = optional_library()
+        if library is None:
+            return matt.to(state.splats.device)
+
+        def image_at(row: int) -> GreyImage:
+            image = self._images[row]
+            return GreyImage(self._camera(state, row), image.grey[0, 0].numpy(), image.usable)
+
+        maps = shine.shine_maps(state.splats, image_at, self._neighbours, self._raster, self._backend, library)
+        return maps.to(state.splats.device)
 
     def _are_shown(self, splats: Splats, large: Tensor) -> Tensor:
         """Return which of the large splats lie on a surface that many images show, uint8 [N]."""
@@ -184,8 +209,9 @@ class Robustness:
         result[rows] = (self._free.showing(splats.rows(rows)) >= max(3, SHOWN * len(self._images))).byte()
         return result
 
-    def _tried(self, state: TrainState, stage: Stage, iteration: int, splats: Splats, spared: Tensor) -> Tensor:
-        """Propose splats that are not spared, and try them: NEEDED, REMOVED or 0, uint8 [N]."""
+    def _tried(self, state: TrainState, stage: Stage, iteration: int, spared: Tensor) -> Tensor:
+        """Propose splats that are not spared [N], and try them: NEEDED, REMOVED or 0, uint8 [N]."""
+        splats = state.splats
         last = ends_part(self._recipe, stage, iteration)
         against = self._proposed(state, splats, last=last).masked_fill(spared, 0)
         verdict = torch.zeros(len(splats), dtype=torch.uint8, device=splats.device)
@@ -226,16 +252,21 @@ class Robustness:
         return against
 
     def _witnesses(self, state: TrainState, rows: range) -> Iterator[Witness]:
-        views = self._learned.scene_now(state.learned).train
         for row in rows:
             image, device = self._images[row], state.splats.device
-            height, width = image.size
-            (fx, _, cx), (_, fy, cy), _ = image.K.tolist()
-            camera = Camera(width, height, fx, fy, cx, cy, views[row].camera.T_cam_world)
+            camera = self._camera(state, row)
             color = image.color.permute(1, 2, 0).to(device)
             numbers = self._learned.numbers(state.learned, row, color)
             photographed = partial(shown, numbers=numbers, at=ImagePoints(camera))
             yield Witness(camera, color, torch.from_numpy(image.usable).to(device), photographed)
+
+    def _camera(self, state: TrainState, row: int) -> Camera:
+        """Return the current camera of a downscaled image."""
+        image = self._images[row]
+        height, width = image.size
+        (fx, _, cx), (_, fy, cy), _ = image.K.tolist()
+        now = self._learned.camera(state.learned, row, self.scene.train[row].camera, ())
+        return Camera(width, height, fx, fy, cx, cy, now.T_cam_world)
 
     @torch.no_grad()
     def decay(self, state: TrainState, stage: Stage, iteration: int, backend: Backend) -> None:

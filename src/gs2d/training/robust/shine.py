@@ -1,0 +1,132 @@
+"""Find shiny surface: brightness that changes with the direction of view.
+
+Reflections are texture that is not on the surface, so colours mislead the geometry below them as much as where there is
+no texture. For pairs of neighbouring photographs, warped by the rendered depth, u is the share of brightness in their
+difference (``meshing.warped_ncc.brightness_share``). A map of each photograph holds
+
+    255 clamp((u - MATT) / (SHINY - MATT), 0, 1) clamp((c - RARELY) / (OFTEN - RARELY), 0, 1)
+
+in CELLS x CELLS cells, with c the part of their pixels that can be compared; both are averaged over REACH cells. The
+maps of neighbours must show it at the same surface, because people who walk by are bright in one photograph only.
+Losses take shiny pixels for pixels without texture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gs2d.config.recipe import Stage
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.kernels.library import Library
+from gs2d.meshing.fusion_bounds import backproject
+from gs2d.meshing.warped_ncc import DrawnMesh, GreyImage, MatchSettings, brightness_share
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+
+WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are made anew: the surface must be there
+MATT, SHINY, RARELY, OFTEN = 0.1, 0.2, 0.1, 0.3  # as in mesh refinement
+CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny things have matt-looking spots
+TINY = 1e-12
+LEAST = 0.05  # mean weight below which a cell is matt: no texture, which flatness tells
+
+
+def is_due(stage: Stage, iteration: int) -> bool:
+    """Return whether the maps are made at the end of an iteration (1-based) of a stage."""
+    return stage.moves_all and iteration in {round(part * stage.iterations) for part in WHEN}
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A photograph, usable away from outlines, and the rendered depth [H, W] world units, 0 without a surface."""
+
+    image: GreyImage
+    depth: np.ndarray
+
+
+@torch.no_grad()
+def shine_maps(
+    splats: Splats,
+    image_at: Callable[[int], GreyImage],
+    neighbours: Sequence[Sequence[int]],
+    settings: RasterSettings,
+    backend: Backend,
+    library: Library,
+) -> Tensor:
+    """Return how shiny the surface is in each photograph.
+
+    Parameters
+    ----------
+    splats : Splats
+    image_at : callable
+        Returns a downscaled photograph.
+    neighbours : sequence of sequence of int
+        Photographs that each one is compared with; without any, all of it counts as matt.
+    settings : RasterSettings
+    backend : Backend
+    library : Library
+
+    Returns
+    -------
+    Tensor [V, CELLS, CELLS] uint8
+        From 0, matt, to 255.
+    """
+    settings = settings.for_depths("transmittance")
+
+    @cache
+    def seen(index: int) -> _Seen:
+        image = image_at(index)
+        output = rasterize(splats, image.camera, settings, backend=backend)
+        depth = torch.where(output.alpha > 0.5, output.depth("transmittance"), 0.0).cpu().numpy()
+        inner = DrawnMesh(np.zeros(0, np.int32), depth).inner(image.camera.fx)
+        return _Seen(replace(image, usable=inner if image.usable is None else inner & image.usable), depth)
+
+    maps = np.zeros((len(neighbours), CELLS, CELLS))
+    for index, others in enumerate(neighbours):
+        if others:
+            maps[index] = _shine(seen(index), [seen(other) for other in others], library)
+    confirmed = np.zeros(maps.shape, np.uint8)
+    for index, others in enumerate(neighbours):
+        if others:
+            there = _shown_by(seen(index), [(seen(other).image.camera, maps[other]) for other in others])
+            confirmed[index] = np.rint(255 * np.minimum(maps[index], there))
+    return torch.from_numpy(confirmed)
+
+
+def _shine(view: _Seen, beside: Sequence[_Seen], library: Library) -> np.ndarray:
+    """Return how shiny the surface is in the cells of a photograph, from 0 to 1."""
+    pairs = [(other.image, other.depth) for other in beside]
+    share, weight, compared = brightness_share(view.image, view.depth, pairs, MatchSettings(), library)
+    values = np.stack([share * weight, weight, compared, view.depth > 0]).astype(np.float64)
+    sums = F.adaptive_avg_pool2d(torch.from_numpy(values)[:, None], CELLS)
+    means = F.avg_pool2d(sums, REACH, 1, REACH // 2, count_include_pad=False)[:, 0].numpy()
+    bright, textured, often, drawn = means
+    shiny = np.clip((bright / np.maximum(textured, TINY) - MATT) / (SHINY - MATT), 0, 1)
+    shiny *= np.clip((often / np.maximum(drawn, TINY) - RARELY) / (OFTEN - RARELY), 0, 1)
+    return np.where(textured > LEAST, shiny, 0.0)
+
+
+def _shown_by(view: _Seen, maps: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
+    """Return the lower median of what other maps show at the surface in the cells of a photograph."""
+    camera, centres = view.image.camera, (np.arange(CELLS) + 0.5) / CELLS
+    rows, columns = (np.floor(centres * side).astype(int) for side in view.depth.shape)
+    rows, columns = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
+    depth = view.depth[rows, columns].astype(np.float64)
+    places, shown = backproject(camera, depth, rows, columns), np.full((len(maps), len(depth)), np.nan)
+    for number, (other, there) in enumerate(maps):
+        pixels, z = other.project(places)
+        cells = np.floor(pixels / (other.width, other.height) * CELLS)
+        inside = (depth > 0) & (z > 0) & (cells >= 0).all(axis=1) & (cells < CELLS).all(axis=1)
+        column, row = cells[inside].astype(int).T
+        shown[number, inside] = there[row, column]
+    shown.sort(axis=0)  # NaN last
+    middle = np.maximum(np.isfinite(shown).sum(axis=0) - 1, 0) // 2
+    return np.nan_to_num(shown[middle, np.arange(len(depth))]).reshape(CELLS, CELLS)
