@@ -264,18 +264,18 @@ class Trainer:
             limit = self._options.stage2_cache_bytes // together.place.local_size
             self._objective = choose_objective(self._whole, state, stage, limit, together.size)
         reports = any(i % self._options.progress_every == 0 for i in iterations) or iteration == stage.iterations
-        changes_rows = any(self._changes(i) or self._robust.removes(stage, i) for i in iterations)
+        changes = any(self._changes(i) or self._robust.acts(stage, i) for i in iterations)
         result, happened = self._learner.iterate(
             partial(self._learn, stage, turns),
             rollback=partial(self._rollback, stage, turns),
-            exact=reports or changes_rows or together.size > 1,  # sums over processes cannot be undone
+            exact=reports or changes or together.size > 1,  # sums over processes cannot be undone
         )
         for number in iterations:
             happened += self._robust.remove(self.state, stage, number)
             if self._needs_flatness:
                 self._robust.find_shine(self.state, stage, number)
         state.step = iteration
-        if changes_rows:
+        if changes:
             together.check(state)
         for event in happened:
             self._on_event(event)

@@ -141,6 +141,10 @@ class Robustness:
         if self._free is not None:
             self._free.move_to(device)
 
+    def acts(self, stage: Stage, iteration: int) -> bool:
+        """Return whether the state may change at the end of an iteration (1-based) of a stage, besides decay."""
+        return self.removes(stage, iteration) or self._looks_for_shine(stage, iteration)
+
     def removes(self, stage: Stage, iteration: int) -> bool:
         """Return whether splats may be removed at the end of an iteration (1-based) of a stage."""
         return looks_at_free_space(self._recipe, stage, iteration) or ends_part(self._recipe, stage, iteration)
@@ -184,10 +188,13 @@ class Robustness:
 
     def find_shine(self, state: TrainState, stage: Stage, iteration: int) -> None:
         """Find out where photographs show shiny surface, if due; without the native library they count as matt."""
-        if self._recipe.removal is None or not shine.is_due(stage, iteration):
+        if not self._looks_for_shine(stage, iteration):
             return
         found = torch.zeros((len(self.scene.train), shine.CELLS, shine.CELLS), dtype=torch.uint8)
         state.shine = self._decide(partial(self._shine, state, found), found.to(state.splats.device))
+
+    def _looks_for_shine(self, stage: Stage, iteration: int) -> bool:
+        return self._recipe.removal is not None and shine.is_due(stage, iteration)
 
     def _shine(self, state: TrainState, matt: Tensor) -> Tensor:
         library = optional_library()
