@@ -33,10 +33,10 @@ from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
 from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
 from gs2d.evaluation.image_metrics import image_metrics, psnr_float
+from gs2d.pipeline.prepare.learned_views import photographed
 from gs2d.pipeline.prepare.options import Training
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, robust_and_exposure, with_backdrop
-from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.render.api import rasterize
 from gs2d.render.exposure_transform import fit_exposure
 from gs2d.render.types import RasterSettings

@@ -20,8 +20,8 @@ from gs2d.core.camera import Camera
 from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, RunFolder
-from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.run_images import render_run
+from gs2d.pipeline.finish.viewpoints import orbit_cameras
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.training.events import ignore

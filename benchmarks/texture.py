@@ -37,10 +37,10 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import bilinear
 from gs2d.pipeline.finish.run_texture import textured_mesh
+from gs2d.pipeline.prepare.learned_views import as_scene
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import TextureOptions
-from gs2d.pipeline.prepare.run_appearance import as_scene
 
 SAMPLES = 2  # rays per pixel along each axis
 

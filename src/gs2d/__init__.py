@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gs2d.cli.command_registry import register_command
+    from gs2d.cli.commands import register_command
     from gs2d.config.actions import register_action
     from gs2d.config.densify import register_densifier
     from gs2d.config.loss_registry import register_loss
@@ -151,7 +151,7 @@ _HOME = {
     "register_action": "gs2d.config.actions",
     "register_backend": "gs2d.render.backends",
     "register_camera_model": "gs2d.data.camera_models",
-    "register_command": "gs2d.cli.command_registry",
+    "register_command": "gs2d.cli.commands",
     "register_densifier": "gs2d.config.densify",
     "register_evaluator": "gs2d.evaluation.evaluators",
     "register_format": "gs2d.io.formats.splat_formats",

@@ -9,7 +9,7 @@ import pytest
 from cli_runs import TINY
 from gs2d.cli import run
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.prepare.quality import QUALITIES, quality_level
+from gs2d.pipeline.prepare.open_capture import QUALITIES, quality_level
 from gs2d.render.backends import BACKENDS, get_backend
 from gs2d.render.reference_backend import ReferenceBackend
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.cli.bar import Bar
-from gs2d.cli.console import Console
+from gs2d.cli.console import Bar, Console
 from gs2d.training.events import Notice, Phase, Step
 from terminal import ESCAPES, raw_screen_of
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import gs2d
 from capture_writers import small_colmap
 from cli_process import CliProcess
-from gs2d.cli.command_registry import COMMANDS
+from gs2d.cli.commands import COMMANDS
 from gs2d.config.presets import RECIPES
 from gs2d.config.protocols import PROTOCOLS
 from gs2d.config.registry import Registry, contrib_entries

@@ -30,9 +30,9 @@ from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper import paper
 from gs2d.errors import DataError, Gs2dError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.finish.export import export_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.finish.splat_files import export_run
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.options import ReconstructOptions, Training
 from gs2d.pipeline.train.train_run import train

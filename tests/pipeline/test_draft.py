@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 
-import gs2d.pipeline.prepare.quality as module
+import gs2d.pipeline.prepare.open_capture as module
 from ball_runs import options
 from capture_writers import small_colmap
 from gs2d.config.presets import get_recipe
 from gs2d.errors import RecipeError
-from gs2d.pipeline.prepare.open_capture import FEW, OpenCapture, open_capture
+from gs2d.pipeline.prepare.open_capture import FEW, OpenCapture, QualityLevel, open_capture
 from gs2d.pipeline.prepare.options import ReconstructOptions, TrainOptions
-from gs2d.pipeline.prepare.quality import QualityLevel
 from gs2d.pipeline.prepare.resolve import schedule_scale_of
 from gs2d.pipeline.reconstruct import CAPTURE, train_options
 from gs2d.pipeline.train.train_run import train

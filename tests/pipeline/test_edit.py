@@ -17,8 +17,8 @@ from gs2d import Splats, rasterize, read_splats, write_splats
 from gs2d.cli import run as gs2d
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.finish import edit as module
-from gs2d.pipeline.finish.edit import edit
+from gs2d.pipeline.finish import splat_files as module
+from gs2d.pipeline.finish.splat_files import edit
 from gs2d.pipeline.prepare.options import EditOptions
 from gs2d.pipeline.train.train_run import train
 from splat_scenes import a_scene

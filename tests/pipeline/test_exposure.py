@@ -17,9 +17,9 @@ from gs2d.errors import RunError
 from gs2d.io.run_dir import LEARNED, RunFolder
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.prepare.learned_views import exposure_gain
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
-from gs2d.pipeline.prepare.run_appearance import exposure_gain
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, ignore
 

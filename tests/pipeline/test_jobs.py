@@ -18,10 +18,10 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.finish.export import export_run
 from gs2d.pipeline.finish.run_images import file_names, render_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.finish.splat_files import export_run
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions, RenderOptions
 from gs2d.pipeline.train.train_run import train

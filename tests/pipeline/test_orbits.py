@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.pipeline.finish.camera_paths import orbit_cameras
+from gs2d.pipeline.finish.viewpoints import orbit_cameras
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -9,8 +9,7 @@ import pytest
 
 from gs2d.data.exif import Taken
 from gs2d.errors import DataError
-from gs2d.pipeline.prepare.photo_positions import metric_positions
-from gs2d.pipeline.prepare.pose_finding import _matching
+from gs2d.pipeline.prepare.pose_finding import _matching, metric_positions
 from gs2d.sfm.photos import Photo
 
 DEGREE = 111_195.0  # m of latitude, approximately

@@ -21,9 +21,9 @@ from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.prepare.learned_views import aligned, camera_motion
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
 from gs2d.pipeline.prepare.options import EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
-from gs2d.pipeline.prepare.run_poses import aligned, camera_motion
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, Step, ignore
 

@@ -20,8 +20,8 @@ from typing import NoReturn
 
 import gs2d
 from gs2d.cli.command_line import NAMES
-from gs2d.cli.command_registry import COMMANDS
 from gs2d.cli.commands import (
+    COMMANDS,
     Common,
     DoctorCommand,
     InfoCommand,

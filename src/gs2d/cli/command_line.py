@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from gs2d.cli.command_registry import COMMANDS
+from gs2d.cli.commands import COMMANDS
 from gs2d.config.arguments import Arg
 
 NAMES: dict[str, type] = {name: command.options for name, command in COMMANDS.working()}

@@ -7,8 +7,7 @@ import shutil
 from collections.abc import Sequence
 
 from gs2d.cli.command_line import NAMES, Option, about, options_of
-from gs2d.cli.command_registry import COMMANDS, GROUPS
-from gs2d.cli.commands import Common
+from gs2d.cli.commands import COMMANDS, GROUPS, Common
 from gs2d.pipeline.prepare.options import CommonTraining, HowItRuns, PoseEstimation, Training
 
 _SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."

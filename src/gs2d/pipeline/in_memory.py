@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
 
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
+from gs2d.core.text import printable
 from gs2d.data import Scene, load_scene
 from gs2d.data.subject_box import OBJECT
 from gs2d.errors import DataError, ProtocolError
@@ -23,10 +29,9 @@ from gs2d.pipeline.prepare.open_capture import capture_in_memory
 from gs2d.pipeline.prepare.options import MeshOptions, Training
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import recipe_of, resolve
-from gs2d.pipeline.train.progress_bar import progress_bar
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.events import OnEvent, ignore
+from gs2d.training.events import Event, Notice, OnEvent, Progress, StageStarted, ignore
 from gs2d.training.trainer import Trainer, raster_settings
 
 __all__ = ["Trained", "evaluate", "extract_mesh", "train"]
@@ -234,3 +239,26 @@ def extract_mesh(
         found = subject_in(finished, finished.splats, options.subject_box)
         subject = found if found.kind == OBJECT else None
     return fused(finished, finished.splats, options, on_event, subject=subject).mesh
+
+
+@contextmanager
+def progress_bar(on_event: OnEvent) -> Iterator[OnEvent]:
+    """Yield a listener that shows notices and a bar per stage on stderr, and forwards events."""
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bars(*columns, console=Console(stderr=True, highlight=False)) as bars:
+        task = bars.add_task("preparing", total=None)
+
+        def shown(event: Event) -> None:
+            nonlocal task
+            if isinstance(event, Notice):
+                bars.console.print(f"note {printable(event.text)}", markup=False, soft_wrap=True)
+            elif isinstance(event, StageStarted):
+                if bars.tasks[-1].total is None:
+                    bars.remove_task(task)
+                task = bars.add_task(event.stage, total=event.iterations)
+            elif isinstance(event, Progress):
+                text = f"{event.stage}, loss {event.loss:.4f}, {event.splats:,} splats"
+                bars.update(task, completed=event.iteration, description=text)
+            on_event(event)
+
+        yield shown

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from gs2d.cli.command_registry import BEGIN, register_command
-from gs2d.cli.commands import Common
+from gs2d.cli.commands import BEGIN, Common, register_command
 from gs2d.config.arguments import PYTHON_ONLY
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.recipe import Recipe

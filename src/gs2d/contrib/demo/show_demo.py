@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gs2d.cli.console import Console
-from gs2d.cli.results import show_run
+from gs2d.cli.handlers import show_run
 from gs2d.contrib.demo.demo_command import DemoCommand
 from gs2d.contrib.demo.run_demo import demo
 

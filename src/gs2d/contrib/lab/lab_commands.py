@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gs2d.cli.command_registry import MEASURE, STEPS, register_command
-from gs2d.cli.commands import Common
+from gs2d.cli.commands import MEASURE, STEPS, Common, register_command
 from gs2d.contrib.lab.lab_options import BlocksOptions, SweepOptions
 
 _ACTIONS = "gs2d.contrib.lab.show_table"

@@ -24,12 +24,12 @@ from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import peak_memory, score_views, split_metrics
+from gs2d.pipeline.prepare.learned_views import with_learned_appearance, write_appearance
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun
-from gs2d.pipeline.prepare.run_appearance import with_learned_appearance, write_appearance
 from gs2d.pipeline.train.train_run import finish
 from gs2d.training.events import OnEvent
 from gs2d.training.trainer import raster_settings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from gs2d.cli.console import Console
-from gs2d.cli.results import show_run
+from gs2d.cli.handlers import show_run
 from gs2d.contrib.lab.blocks import blocks
 from gs2d.contrib.lab.lab_commands import BlocksCommand, SweepCommand
 from gs2d.contrib.lab.paper import PaperResult

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from gs2d.cli.command_registry import LOOK, register_command
-from gs2d.cli.commands import Common, RunPath
+from gs2d.cli.commands import LOOK, Common, RunPath, register_command
 from gs2d.config.arguments import SETTING, Arg
 from gs2d.pipeline.prepare.options import Options
 

@@ -15,11 +15,10 @@ from gs2d.pipeline.attempts import attempted_file
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.finish.scoring import RenderedPhotograph, score_views, split_metrics
+from gs2d.pipeline.prepare.learned_views import aligned, matched_by_halves
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_appearance import matched_by_halves
-from gs2d.pipeline.prepare.run_poses import aligned
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
 
 

@@ -26,12 +26,12 @@ from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RENDERS, RunFolder, make_folder, remove_made
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
+from gs2d.pipeline.finish.viewpoints import orbit_cameras
+from gs2d.pipeline.prepare.learned_views import photographed
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.options import RenderOptions
-from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput

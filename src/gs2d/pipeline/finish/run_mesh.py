@@ -1,4 +1,4 @@
-"""The mesh of a run: fused depth maps of the training views."""
+"""The mesh of a run: fused depth maps of the training views, refined with the photographs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import torch
 
 from gs2d.core.atomic_files import disk_error
 from gs2d.core.memory_limit import memory_budget
+from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
 from gs2d.data import View
@@ -22,23 +23,26 @@ from gs2d.data.subject_box import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError
 from gs2d.io.meshes import write_mesh, write_pieces
 from gs2d.io.run_dir import MESH, SURFACE, TEXTURED, RunFolder
+from gs2d.kernels.library import ready_library
 from gs2d.meshing.convex_pieces import convex_pieces, required
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.extract import Extraction, ExtractOptions
 from gs2d.meshing.mesh_methods import MESH_METHODS, method_name
+from gs2d.meshing.refine import Refinement, RefineSettings
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES
+from gs2d.meshing.texture import ColorSource
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
-from gs2d.pipeline.finish.run_refine import refined
+from gs2d.meshing.warped_ncc import GreyImage
 from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
-from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, within_reach
+from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, usable_pixels, within_reach
 from gs2d.pipeline.prepare.limits import release, release_buffers
 from gs2d.pipeline.prepare.loaded import RenderedScene, checked_output, open_finished
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
-from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
+from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
 ONE_SURFACE = 0.02  # of the depth; if mean and median differ by more, a pixel shows several surfaces
 SEVERAL = 0.25  # weight of such a pixel
@@ -52,6 +56,8 @@ LEAST_SLAB_BYTES = 32 << 20  # smaller slabs spend most of the time on preparing
 MOSTLY_CUT = 0.5  # fraction of the depth outside the mesh from which a notice is sent
 COARSER_ERROR = 4.0  # times that of the level of detail before: about a quarter of its faces
 COARSER = 3  # attempts with larger voxels: the first size is an estimate
+GREY = (0.299, 0.587, 0.114)  # ITU-R BT.601
+LEAST_VIEWS = 2
 
 
 # -- extraction --------------------------------------------------------------------------------------------------------
@@ -286,6 +292,32 @@ def checked_mesh_file(path: Path, out: Path, options: MeshOptions) -> Path:
     if options.lods > 1 and not glb:
         raise ProtocolError(f"lods={options.lods} needs --out FILE.glb, got {out}; PLY files have one level of detail")
     return checked_output(path, out, ".glb" if glb else ".ply", "a mesh (or .glb)")
+
+
+# -- refinement --------------------------------------------------------------------------------------------------------
+def refined(
+    loaded: RenderedScene,
+    mesh: Mesh,
+    on_event: OnEvent,
+    settings: RefineSettings = RefineSettings(),  # noqa: B008 (frozen)
+) -> Mesh:
+    """Move the vertices of a mesh until the training views agree; ``mesh`` is not changed.
+
+    Without two views or a surface it is returned as it is.
+    """
+    views = loaded.scene.train
+    if len(views) < LEAST_VIEWS or not len(mesh.faces):
+        return mesh
+
+    def read(index: int, factor: int) -> GreyImage:
+        view = views[index]
+        small = ColorSource(view.camera, view.image(), usable_pixels(view, loaded)).shrunk(factor)
+        grey = small.image[..., :3] @ np.asarray(GREY, np.float32) / np.float32(255)
+        return GreyImage(small.camera, np.ascontiguousarray(grey, np.float32), small.valid)
+
+    refinement = Refinement(mesh, [view.camera for view in views], read, settings, ready_library())
+    on_event(Phase("refining the mesh", refinement.work))
+    return refinement.run(lambda done: on_event(Step(done)))
 
 
 # -- gs2d mesh ---------------------------------------------------------------------------------------------------------

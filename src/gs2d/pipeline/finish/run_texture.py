@@ -33,10 +33,10 @@ from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.trusted_depth import usable_pixels
+from gs2d.pipeline.prepare.learned_views import as_scene
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
-from gs2d.pipeline.prepare.run_appearance import as_scene
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
 PACKAGES = ("xatlas",)  # of the extra `texture`

@@ -14,7 +14,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics, mean_metrics, psnr_float
 from gs2d.evaluation.lpips import Lpips
-from gs2d.pipeline.prepare.run_appearance import photographed
+from gs2d.pipeline.prepare.learned_views import photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput

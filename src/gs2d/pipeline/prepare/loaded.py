@@ -23,13 +23,12 @@ from gs2d.errors import DataError, RunError
 from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
+from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_refined_poses
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_execution, check_options, resolve, schedule_scale_of
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
-from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
-from gs2d.pipeline.prepare.run_poses import with_refined_poses
 from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend

@@ -1,14 +1,19 @@
-"""Open a capture for training: choose its protocol, image size and backend."""
+"""Open a capture for training: choose its protocol, training length, image size and backend."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
 
 from gs2d.config.protocols import Protocol, get_protocol, protocol_for
+from gs2d.config.recipe import Recipe
+from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.data import Scene, detect_format, load_scene
 from gs2d.data.known_captures import protocol_of
@@ -19,7 +24,6 @@ from gs2d.errors import ProtocolError
 from gs2d.io.run_dir import RunFolder, is_run
 from gs2d.pipeline.prepare.limits import check_memory, least_downscale
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.quality import QualityLevel, quality_level
 from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.sfm.workspace import POSES_JSON
 from gs2d.training.events import Event, Notice, OnEvent
@@ -28,6 +32,51 @@ SHOWN_SKIPS = 3
 FEW = 24  # photographs found by `gs2d poses`; with fewer, all are needed for the surface
 
 
+# -- quality -----------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class QualityLevel:
+    """Iterations (None: all of the recipe) and approximate longer side of the images in px."""
+
+    iterations: int | None
+    side: int
+
+    def schedule_scale(self, recipe: Recipe) -> float:
+        """Return the fraction of the recipe that is trained, at most 1."""
+        return 1.0 if self.iterations is None else min(1.0, self.iterations / max(1, recipe.iterations))
+
+    def downscale(self, cameras: Sequence[Camera]) -> int:
+        """Return the factor by which images shrink so that the largest has about this side."""
+        side = max(max(camera.width, camera.height) for camera in cameras)
+        return max(1, math.floor(side / self.side + 0.5))
+
+
+_FULL = QualityLevel(None, 1600)  # the image size of the official code
+QUALITIES: Mapping[str, Mapping[str, QualityLevel]] = MappingProxyType(
+    {
+        "draft": {"cpu": QualityLevel(1_800, 400), "gpu": QualityLevel(6_000, 800)},
+        "normal": {"cpu": QualityLevel(6_000, 800), "gpu": QualityLevel(30_000, 1600)},
+        "full": {"cpu": _FULL, "gpu": _FULL},
+    }
+)
+
+
+def quality_level(name: str, *, is_data_set: bool, on_host: bool) -> QualityLevel | None:
+    """Return what a quality means; None: the whole recipe on full-size images.
+
+    Parameters
+    ----------
+    name : str
+    is_data_set : bool
+        Whether the capture belongs to a data set with a protocol of its own, for which "auto" is the whole recipe.
+    on_host : bool
+        Whether the CPU trains.
+    """
+    if name == "auto" and is_data_set:
+        return None
+    return QUALITIES["normal" if name == "auto" else name]["cpu" if on_host else "gpu"]
+
+
+# -- the capture -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class OpenCapture:
     """A capture as a training sees it.

@@ -20,10 +20,9 @@ from gs2d.pipeline.finish.scoring import (
     score_views,
     split_metrics,
 )
+from gs2d.pipeline.prepare.learned_views import write_appearance, write_poses
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_appearance import write_appearance
-from gs2d.pipeline.prepare.run_poses import write_poses
 from gs2d.pipeline.train.resume import put_in_cache
 from gs2d.training.events import OnEvent, StageScored
 from gs2d.training.trainer import Trainer

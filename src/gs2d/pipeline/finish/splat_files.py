@@ -1,4 +1,4 @@
-"""Edit the splats of a run so that the edit can be undone, or write an edited splat file.
+"""Write the splats of a run or a file in another format, or edit them.
 
 An edit of a run keeps the replaced file as ``edits/0001.ply``, ``edits/0002.ply`` ...; undoing renames the last one
 back. Attributes of splats that an edit does not concern keep their bits.
@@ -20,17 +20,66 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import transform_splats
 from gs2d.data.subject_box import LARGEST
 from gs2d.errors import RunError
-from gs2d.io.formats.splat_formats import write_layout
+from gs2d.io import splat_ply
+from gs2d.io.formats.splat_formats import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
 from gs2d.io.gaussians import Gaussians, Tell
-from gs2d.io.run_dir import EDITS, SPLATS, RunFolder, make_folder, open_run
-from gs2d.io.splat_ply import read_splats, write_splats
+from gs2d.io.run_dir import EDITS, MESH, SPLATS, RunFolder, make_folder, open_run
 from gs2d.pipeline.attempts import REMADE_BY, remade_by
-from gs2d.pipeline.finish.export import checked_layout, splats_of
 from gs2d.pipeline.finish.run_subject import centers_inside
-from gs2d.pipeline.prepare.loaded import finished_splats
+from gs2d.pipeline.prepare.loaded import checked_output, finished_splats
 from gs2d.pipeline.prepare.options import EditOptions, Transform
 
 
+# -- gs2d export -------------------------------------------------------------------------------------------------------
+def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, Any]:
+    """Write the splats of a run, or of a file of flat splats, in another format.
+
+    Parameters
+    ----------
+    layout : str or None
+        A name in ``io.formats.splat_formats.LAYOUTS``; None: by the ending of ``out``.
+    """
+    path, out = Path(path), Path(out)
+    layout = checked_layout(path, out, layout)
+    notes: list[str] = []
+    splats = splats_of(path, notes.append)
+    notes += write_layout(out, splats, layout)
+    size = written_bytes(out, layout)
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes}
+
+
+def checked_layout(path: Path, out: Path, layout: str | None = None) -> str:
+    """Return the layout of the splat file ``out`` that is written from the run or file ``path``.
+
+    Raises
+    ------
+    RunError
+        If there is no such layout, ``out`` has another ending, or is a file that must not be replaced.
+    """
+    layout = layout or layout_of(out)
+    if layout is None:
+        raise RunError(
+            f"--out must end in {', '.join(endings()).replace('/', '')}, got {out} (meshes are written by `gs2d mesh "
+            "RUN`: .ply, with --texture .glb or .obj)"
+        )
+    if layout not in LAYOUTS:
+        raise RunError(LAYOUTS.unknown(layout))
+    checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout}")
+    if out.resolve() in ((path / MESH).resolve(), path.resolve()):
+        raise RunError(f"--out {out} is the mesh of the run or the input file; choose another name")
+    return layout
+
+
+def splats_of(path: Path, tell: Tell) -> Splats:
+    """Return the splats of a finished run or of a file of flat splats; ``tell`` receives what a reader dropped."""
+    if path.is_file():
+        return read_splats(path, tell)
+    run = open_run(path)
+    run.sweep()
+    return finished_splats(run)
+
+
+# -- gs2d edit ---------------------------------------------------------------------------------------------------------
 def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str, Any]:
     """Edit the splats of a run, or write the edited splats of a run or a file to ``out``.
 
@@ -152,7 +201,7 @@ def _replace(run: RunFolder, before: Splats, edited: Splats) -> None:
         with atomic_write(kept) as file, open(path, "rb") as source:
             shutil.copyfileobj(source, file)
         shutil.copystat(path, kept)
-    write_splats(path, edited)
+    splat_ply.write_splats(path, edited)
 
 
 def _undone(run: RunFolder) -> Splats:
@@ -160,7 +209,7 @@ def _undone(run: RunFolder) -> Splats:
     versions = _versions(run)
     if not versions:
         raise RunError(f"{run.path} has no edit to undo")
-    restored = read_splats(versions[-1])  # raises if it is damaged
+    restored = splat_ply.read_splats(versions[-1])  # raises if it is damaged
     os.replace(versions.pop(), run.file(SPLATS))
     if not versions:
         shutil.rmtree(run.file(EDITS), ignore_errors=True)
