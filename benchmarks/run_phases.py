@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from benchmarks.sampler import Rule
 
-RESULTS, LOOP = "pipeline/train/stage_results.py", "training/trainer.py"
+LOGGER, LOOP = "pipeline/train/run_logger.py", "training/trainer.py"
 RUN_PHASES = (  # names missing from a version of the code never match
     Rule(
         "read the capture",
         (("pipeline/prepare/loaded.py", "prepare_run"), ("pipeline/prepare/loaded.py", "reload_run")),
     ),
-    Rule("PSNR curve", ((RESULTS, "probe_psnr"),)),
+    Rule("PSNR curve", ((LOGGER, "_probe_psnr"),)),
     Rule("pictures", (("pipeline/finish/run_images.py", "draw_stage"),)),
-    Rule("score a stage", ((RESULTS, "_score_stage"),)),
-    Rule("checkpoints", (("pipeline/train/run_logger.py", "_save"),)),
+    Rule("score a stage", ((LOGGER, "_score_stage"),)),
+    Rule("checkpoints", ((LOGGER, "_save"),)),
     Rule("initial splats", ((LOOP, "_first_state"),)),
     Rule("rank by E_i", (("training/actions/rank_by_error.py", "run"),)),
     Rule("fill the stage 2 cache", (("training/cached_objective.py", "choose_objective"),)),

@@ -58,15 +58,15 @@ def test_an_internal_error_is_exit_code_1_with_a_traceback_only_with_verbose(
 def test_ctrl_c_exits_with_130_and_names_the_command_that_resumes(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline.train.stage_results import StageResults
+    from gs2d.pipeline.train.run_logger import RunLogger
 
-    score = StageResults.score
+    score = RunLogger.score
 
-    def interrupted(self: StageResults, index: int, facts: dict[str, object]) -> None:
+    def interrupted(self: RunLogger, index: int, facts: dict[str, object]) -> None:
         score(self, index, facts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(StageResults, "score", interrupted)
+    monkeypatch.setattr(RunLogger, "score", interrupted)
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--threads", "1", *TINY]
     assert run(words) == 130
     line = capsys.readouterr().err.strip()

@@ -34,7 +34,7 @@ from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.splat_files import export_run
 from gs2d.pipeline.look.page import page_run
-from gs2d.pipeline.prepare.options import ReconstructOptions, Training
+from gs2d.pipeline.prepare.options import ReconstructOptions
 from gs2d.pipeline.train.train_run import train
 from room_photos import write_room
 from tiny import write_capture
@@ -305,7 +305,7 @@ class Reconstruct(Command):
                 schedule_scale=0.0005,
                 downscale=8,
                 backend="cpu",
-                training=Training(overrides=FEW),
+                overrides=FEW,
             )
         )
 

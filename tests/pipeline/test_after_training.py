@@ -19,12 +19,12 @@ from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, NotMade
 
 LATER = {  # steps after training, with the result that is missing if they fail
-    "train.stage_results.write_poses": "refined cameras and exposures",
-    "train.stage_results.write_appearance": "refined cameras and exposures",
-    "train.stage_results.score_views": "scores of train views, stage refine",
-    "train.stage_results.split_metrics": "scores of train views, stage refine",
-    "train.stage_results.draw_stage": "images of stage refine",
-    "train.stage_results.StageScored": "scores of stage refine",
+    "train.run_logger.write_poses": "refined cameras and exposures",
+    "train.run_logger.write_appearance": "refined cameras and exposures",
+    "train.run_logger.score_views": "scores of train views, stage refine",
+    "train.run_logger.split_metrics": "scores of train views, stage refine",
+    "train.run_logger.draw_stage": "images of stage refine",
+    "train.run_logger.StageScored": "scores of stage refine",
     "finish.run_mesh.fusion_frame": "mesh.ply",
     "finish.run_verdict.Collector._measure": "verdict.json",
     "train.train_run.meshed_subject": "mesh.ply",
@@ -78,7 +78,7 @@ def test_a_step_that_fails_after_training_is_reported_and_the_splats_remain(
 def test_the_splats_are_written_even_if_views_cannot_be_scored(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gs2d.pipeline.train.stage_results.score_views", failing(DataError("no points")))
+    monkeypatch.setattr("gs2d.pipeline.train.run_logger.score_views", failing(DataError("no points")))
     heard: list[Event] = []
     run = train(options(capture, tmp_path / "run", page=False), heard.append)
     assert len(read_splats(run.file("splats.ply"))) > 0

@@ -14,9 +14,10 @@ import torch
 from ball_runs import Stop, comparable, options
 from gs2d.io.run_dir import CheckpointFile, RunFolder, load_tensors, save_tensors
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
-from gs2d.pipeline.train.resume import ResumePoint, choose_start
+from gs2d.pipeline.train.resume import choose_start
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, Step, ignore
+from gs2d.training.state import TrainState
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +39,14 @@ def job(capture: Path) -> LoadedRun:
     return prepare_run(options(capture, Path("unused")), ignore)
 
 
-def resumed(run: RunFolder, job: LoadedRun, capture: Path, payload: dict[str, Any]) -> tuple[ResumePoint, list[str]]:
+def resumed(
+    run: RunFolder, job: LoadedRun, capture: Path, payload: dict[str, Any]
+) -> tuple[TrainState | None, list[str]]:
     """Return the checkpoint that training resumes from if the last one holds ``payload``, and the notices."""
     save_tensors(run.checkpoints()[-1].path, payload)
     heard: list[Event] = []
-    start = choose_start(run, job, heard.append)
-    return start, [event.text for event in heard if isinstance(event, Notice)]
+    state, _ = choose_start(run, job, heard.append)
+    return state, [event.text for event in heard if isinstance(event, Notice)]
 
 
 def with_change(payload: dict[str, Any], path: tuple[Any, ...], change: Callable[[Any], Any]) -> dict[str, Any]:
@@ -104,9 +107,9 @@ def test_a_checkpoint_with_inconsistent_entries_is_skipped(
     payload = load_tensors(run.checkpoints()[-1].path)
     if path[-1] in ("other", "high_error"):
         payload = with_change(payload, path[:-1], lambda inner: inner | {path[-1]: None})
-    start, said = resumed(run, job, capture, with_change(payload, path, change))
-    assert start.state is not None
-    assert start.state.step == 8
+    state, said = resumed(run, job, capture, with_change(payload, path, change))
+    assert state is not None
+    assert state.step == 8
     assert "0-surface-0000012.pt is not a readable checkpoint" in said[0]
     assert "\n" not in said[0]
 
@@ -144,8 +147,8 @@ def test_a_checkpoint_with_the_name_of_another_is_skipped(
     run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
     last = run.checkpoints()[-1]
     last.path.rename(last.path.with_name("0-surface-end.pt"))
-    start, said = resumed(run, job, capture, load_tensors(run.checkpoints()[-1].path))
+    state, said = resumed(run, job, capture, load_tensors(run.checkpoints()[-1].path))
     assert isinstance(last, CheckpointFile)
-    assert start.state is not None
-    assert start.state.step == 8
+    assert state is not None
+    assert state.step == 8
     assert "it holds stage 0, iteration 12" in said[0]

@@ -57,7 +57,7 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
             "gs2d export {run} --format html",
         ),
         (
-            "train.stage_results.draw_stage",
+            "train.run_logger.draw_stage",
             ValueError("x"),
             "images of stage refine",
             "fault in gs2d: ValueError: x",

@@ -26,7 +26,7 @@ from room_photos import Room, write_room
 from tiny import write_capture
 
 SMALL = {"threads": 1, "quality": "draft", "schedule_scale": 0.0005, "downscale": 8}
-TRAINING = Training(overrides=("init_points=100", "surface.densify.max_splats=150"))
+FEW_SPLATS = ("init_points=100", "surface.densify.max_splats=150")
 
 
 def words_for(photos: Path, out: Path, *words: str) -> list[str]:
@@ -74,7 +74,7 @@ def test_photographs_become_a_run_with_its_capture(
 def test_estimated_cameras_are_reused(room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = started(room, tmp_path)
     monkeypatch.setattr(module, "find_poses", lambda *_: pytest.fail("cameras were looked for again"))
-    options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
+    options = ReconstructOptions(photos=room.photos, out=out, resume=True, overrides=FEW_SPLATS, **SMALL)  # type: ignore[arg-type]
     texts = notices(options)
     assert any(text.startswith(f"using the cameras in {out / 'capture'}: 12 of 12") for text in texts)
     assert (out / "mesh.ply").exists()
@@ -217,7 +217,7 @@ def test_ctrl_c_during_the_search_keeps_results(room: Room, tmp_path: Path) -> N
     assert error_output.splitlines()[-1].endswith(" --resume")
     assert [path.name for path in out.iterdir()] == [".capture.poses"]
     heard: list[Event] = []
-    options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
+    options = ReconstructOptions(photos=room.photos, out=out, resume=True, overrides=FEW_SPLATS, **SMALL)  # type: ignore[arg-type]
     reconstruct(options, heard.append)
     lines = [event.text for event in heard if isinstance(event, Notice)]
     assert any(line.startswith("continuing the interrupted search: features of ") for line in lines)
@@ -249,6 +249,6 @@ def test_every_option_of_train_is_one_of_reconstruct() -> None:
     command = parse(["reconstruct", "photos", "--out", "run", *words])
     assert isinstance(command, commands.ReconstructCommand)
     training = train_options(command)
-    assert values(Training, training) == values(Training, command.training)
+    assert values(Training, training) == values(Training, command)
     assert (training.recipe, training.test_every, training.learned) == ("2dgs", 5, ("exposure",))
     assert poses_options(command).cameras == "each"

@@ -141,10 +141,7 @@ def _help_or_version(argv: Sequence[str]) -> list[str] | None:
 def _for_this_process(command: Common) -> Common:
     """Return the command for this process of several: only process 0 prints.
 
-    Raises
-    ------
-    UsageError
-        If the command cannot run in several processes.
+    Raises UsageError if the command cannot run in several processes.
     """
     place = process_rank()
     if place.size > 1 and not isinstance(command, TrainCommand):

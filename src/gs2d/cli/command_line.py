@@ -33,7 +33,6 @@ class Option:
         Name of the dataclass field.
     flags : tuple of str
         Names on the command line, ``--out``; empty for a setting and a positional argument.
-    mark : Arg
     kind : type
         bool for a switch, else the type of each value.
     choices : tuple of str
@@ -111,13 +110,7 @@ class Option:
         )
 
     def read(self, text: str) -> Any:
-        """Return the value of a setting.
-
-        Raises
-        ------
-        ValueError
-            If the text is no valid value; says what is expected.
-        """
+        """Return the value of a setting. Raises ValueError if the text is no valid value; says what is expected."""
         words = text.split(",") if self.count != 1 else [text]
         try:
             values = tuple(_SWITCH[word] if self.kind is bool else self.kind(word) for word in words)
@@ -135,27 +128,16 @@ def about(kind: type) -> str:
 
 @functools.cache
 def options_of(kind: type) -> tuple[Option, ...]:
-    """Return the options of a command, with those of nested dataclasses, in the order of the fields."""
-    options: list[Option] = []
-    for field, hint, mark in fields_of(kind):
-        if dataclasses.is_dataclass(hint):
-            options += options_of(hint)
-        elif not mark.python_only:
-            options.append(_option(kind, field, hint, mark))
-    return tuple(options)
-
-
-@functools.cache
-def fields_of(kind: type) -> tuple[tuple[dataclasses.Field[Any], type, Arg], ...]:
-    """Return the fields of a dataclass, each with its type and its mark."""
+    """Return the options of a command, in the order of the fields."""
     hints = get_type_hints(kind, include_extras=True)
-    entries = []
+    options = []
     for field in dataclasses.fields(kind):
         hint, mark = hints[field.name], Arg()
         if get_origin(hint) is Annotated:
             hint, mark = get_args(hint)
-        entries.append((field, hint, mark))
-    return tuple(entries)
+        if not mark.python_only:
+            options.append(_option(kind, field, hint, mark))
+    return tuple(options)
 
 
 def _option(kind: type, field: dataclasses.Field[Any], hint: Any, mark: Arg) -> Option:

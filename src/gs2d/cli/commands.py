@@ -31,21 +31,7 @@ GROUPS = (BEGIN, STEPS, LOOK, MEASURE)  # the order of the help; other groups fo
 
 @dataclass(frozen=True)
 class Command:
-    """A command of ``gs2d``.
-
-    Attributes
-    ----------
-    name : str
-    options : type
-        A dataclass of ``gs2d.cli.commands.Common``; its docstring and those of its fields are the help.
-    action : str
-        "module:function"; called with the parsed options and a ``gs2d.cli.console.Console``. The module is imported
-        when the command runs.
-    group : str
-        Heading in ``gs2d --help``.
-    first : tuple of str
-        Fields that ``gs2d COMMAND --help`` explains, the most used first; (): all of this command alone.
-    """
+    """A command of ``gs2d``, as :func:`register_command` describes it; ``options`` is the decorated dataclass."""
 
     name: str
     options: type
@@ -59,11 +45,8 @@ class Command:
         getattr(importlib.import_module(module), function)(options, console)
 
 
-_CORE = (
-    *("doctor", "reconstruct", "view", "poses", "train", "mesh"),
-    *("info", "render", "export", "edit", "evaluate", "recipes"),
-)
-COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE, "gs2d.cli.commands"))
+_CORE = "doctor reconstruct view poses train mesh info render export edit evaluate recipes"
+COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE.split(), __name__))
 
 
 def register_command(
@@ -97,6 +80,11 @@ def register_command(
     return registered
 
 
+def _core(name: str, group: str, *first: str) -> Callable[[Register], Register]:
+    """Register a command of the core; its action is the function of its name in ``handlers``."""
+    return register_command(name, action=f"gs2d.cli.handlers:{name}", group=group, first=first)
+
+
 RunPath = Annotated[Path, Arg(metavar="RUN", positional=True)]
 
 
@@ -113,45 +101,25 @@ class Common:
 
 
 # -- the commands of the core ------------------------------------------------------------------------------------------
-@register_command(
-    "reconstruct",
-    action="gs2d.cli.handlers:reconstruct",
-    group=BEGIN,
-    first=("photos", "out", "quality", "texture", "viewer", "resume", "overwrite"),
-)
+@_core("reconstruct", BEGIN, "photos", "out", "quality", "texture", "viewer", "resume", "overwrite")
 @dataclass(frozen=True, kw_only=True)
 class ReconstructCommand(ReconstructOptions, Common):
     """Turn photographs or a video into splats, mesh and report."""
 
 
-@register_command(
-    "poses",
-    action="gs2d.cli.handlers:poses",
-    group=STEPS,
-    first=("photos", "out", "frames", "camera_model", "matching", "overwrite"),
-)
+@_core("poses", STEPS, "photos", "out", "frames", "camera_model", "matching", "overwrite")
 @dataclass(frozen=True, kw_only=True)
 class PosesCommand(PosesOptions, Common):
     """Find the cameras of photographs, with COLMAP."""
 
 
-@register_command(
-    "train",
-    action="gs2d.cli.handlers:train",
-    group=STEPS,
-    first=("scene", "out", "quality", "recipe", "downscale", "viewer", "resume", "overwrite"),
-)
+@_core("train", STEPS, "scene", "out", "quality", "recipe", "downscale", "viewer", "resume", "overwrite")
 @dataclass(frozen=True, kw_only=True)
 class TrainCommand(TrainOptions, Common):
     """Train on photographs whose cameras are known."""
 
 
-@register_command(
-    "mesh",
-    action="gs2d.cli.handlers:mesh",
-    group=STEPS,
-    first=("run", "out", "texture", "method", "refine", "voxel", "bbox"),
-)
+@_core("mesh", STEPS, "run", "out", "texture", "method", "refine", "voxel", "bbox")
 @dataclass(frozen=True, kw_only=True)
 class MeshCommand(TextureOptions, MeshOptions, Resources, Common):
     """Extract the mesh of a run again, with other settings; or that of a file of splats."""
@@ -171,12 +139,7 @@ class MeshCommand(TextureOptions, MeshOptions, Resources, Common):
     """CPU threads."""
 
 
-@register_command(
-    "render",
-    action="gs2d.cli.handlers:render",
-    group=LOOK,
-    first=("run", "split", "orbit", "width", "video", "out"),
-)
+@_core("render", LOOK, "run", "split", "orbit", "width", "video", "out")
 @dataclass(frozen=True, kw_only=True)
 class RenderCommand(RenderOptions, Resources, Common):
     """Render images or a video of a run."""
@@ -189,7 +152,7 @@ class RenderCommand(RenderOptions, Resources, Common):
     """CPU threads."""
 
 
-@register_command("view", action="gs2d.cli.handlers:view", group=BEGIN)
+@_core("view", BEGIN)
 @dataclass(frozen=True, kw_only=True)
 class ViewCommand(Common):
     """Show splats, mesh and cameras of a run in the browser."""
@@ -200,12 +163,7 @@ class ViewCommand(Common):
     """Port of the page (default: the first free port from 8080)."""
 
 
-@register_command(
-    "evaluate",
-    action="gs2d.cli.handlers:evaluate",
-    group=MEASURE,
-    first=("run", "ground_truth", "lpips_weights"),
-)
+@_core("evaluate", MEASURE, "run", "ground_truth", "lpips_weights")
 @dataclass(frozen=True, kw_only=True)
 class EvaluateCommand(EvaluateOptions, Resources, Common):
     """Score images (PSNR, SSIM, LPIPS) and the mesh of a run."""
@@ -216,7 +174,7 @@ class EvaluateCommand(EvaluateOptions, Resources, Common):
     """CPU threads."""
 
 
-@register_command("export", action="gs2d.cli.handlers:export", group=LOOK)
+@_core("export", LOOK)
 @dataclass(frozen=True, kw_only=True)
 class ExportCommand(Common):
     """Write the splats of a run in another format, or as a web page."""
@@ -231,7 +189,7 @@ class ExportCommand(Common):
     --out; .ply is 3dgs)."""
 
 
-@register_command("edit", action="gs2d.cli.handlers:edit", group=LOOK)
+@_core("edit", LOOK)
 @dataclass(frozen=True, kw_only=True)
 class EditCommand(EditOptions, Common):
     """Delete, merge or move splats of a run, undoably, or of a file."""
@@ -242,7 +200,7 @@ class EditCommand(EditOptions, Common):
     """Write the edited splats to this file, in the format of its ending, and leave the run as it is."""
 
 
-@register_command("recipes", action="gs2d.cli.handlers:recipes", group=MEASURE)
+@_core("recipes", MEASURE)
 @dataclass(frozen=True, kw_only=True)
 class RecipesCommand(Common):
     """List recipes, or print one as JSON."""
@@ -259,7 +217,7 @@ class DoctorCommand(Common):
     """Check what this machine can run, and what is missing."""
 
 
-@register_command("info", action="gs2d.cli.handlers:info", group=LOOK)
+@_core("info", LOOK)
 @dataclass(frozen=True, kw_only=True)
 class InfoCommand(Common):
     """Describe a run, a capture, or a file of splats, mesh or points."""

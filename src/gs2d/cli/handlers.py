@@ -105,26 +105,6 @@ def show_surface(surface: dict[str, Any] | None, console: Console) -> None:
         console.say(f"Chamfer distance {surface['chamfer']:.5g} {surface.get('unit', 'world units')}")
 
 
-def poses_lines(result: dict[str, Any]) -> list[str]:
-    """Return the result of ``gs2d poses``: photographs with and without a camera, and the next command."""
-    from gs2d.pipeline.prepare.pose_finding import lost_lines, placed_line
-
-    lines = [
-        placed_line(result),
-        *(f"camera: {camera['about']}" for camera in result["cameras"][:4]),
-    ]
-    if len(result["cameras"]) > 4:
-        lines.append(f"and {len(result['cameras']) - 4} more cameras, in poses.json")
-    lines += lost_lines(result)
-    for other in result["other_models"]:
-        lines.append(
-            f"{other['folder']} holds a separate piece: {len(other['photos'])} photographs, {other['points']:,} points"
-        )
-    capture = result["capture"]
-    lines.append(f"look at {capture}/poses.png, then: gs2d train {shlex.quote(capture)} --out RUN")
-    return lines
-
-
 # -- actions -----------------------------------------------------------------------------------------------------------
 def _keep_to(gib: float | None) -> None:
     """Limit the memory of a command; training does so itself."""
@@ -153,7 +133,9 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
     if command.run is not None and command.texture:
         _textured_mesh(command.run, command, options, console)
         return
-    _refuse_texture_options(command)
+    for name, default in values(TextureOptions, TextureOptions()).items():
+        if getattr(command, name) != default:
+            raise ProtocolError(f"--set {name} needs --texture; give both")
     out, threads = command.out, command.threads
     if command.run is not None:
         result = mesh_run(command.run, options, console.on_event, out=out, threads=threads)
@@ -174,14 +156,7 @@ def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console
 
     if command.collision or command.lods != 1:
         raise ProtocolError("--texture writes neither convex pieces nor lods; run `gs2d mesh` again without --texture")
-    result = texture_run(
-        run,
-        command,
-        mesh_options,
-        console.on_event,
-        out=command.out,
-        threads=command.threads,
-    )
+    result = texture_run(run, command, mesh_options, console.on_event, out=command.out, threads=command.threads)
     size, unseen = result["texture_size"], result["texels_unseen"] / max(result["texels"], 1)
     console.say(f"{result['files'][0]}: {result['faces']:,} triangles, {result['bytes'] / 1e6:.1f} MB")
     console.say(
@@ -190,25 +165,12 @@ def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console
     console.result(result)
 
 
-def _refuse_texture_options(command: c.MeshCommand) -> None:
-    """Raise for a setting of textures without --texture."""
-    for name, default in values(TextureOptions, TextureOptions()).items():
-        if getattr(command, name) != default:
-            raise ProtocolError(f"--set {name} needs --texture; give both")
-
-
 def render(command: c.RenderCommand, console: Console) -> None:
     """``gs2d render``."""
     from gs2d.pipeline.finish.run_images import render_run
 
     _keep_to(command.memory)
-    result = render_run(
-        command.run,
-        command,
-        console.on_event,
-        out=command.out,
-        threads=command.threads,
-    )
+    result = render_run(command.run, command, console.on_event, out=command.out, threads=command.threads)
     console.say(f"{result['images']} images in {result['folder']}")
     if "video" in result:
         console.say(f"{result['video']}: {result['seconds']:.1f} s, {result['video_bytes'] / 1e6:.1f} MB")
@@ -323,12 +285,21 @@ def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
 
 
 def poses(command: c.PosesCommand, console: Console) -> None:
-    """``gs2d poses``."""
-    from gs2d.cli.handlers import poses_lines
-    from gs2d.pipeline.prepare.pose_finding import find_poses
+    """``gs2d poses``: photographs with and without a camera, and the next command."""
+    from gs2d.pipeline.prepare.pose_finding import find_poses, lost_lines, placed_line
 
     result = find_poses(command, console.on_event)
-    for line in poses_lines(result):
+    cameras, capture = result["cameras"], result["capture"]
+    lines = [placed_line(result), *(f"camera: {camera['about']}" for camera in cameras[:4])]
+    if len(cameras) > 4:
+        lines.append(f"and {len(cameras) - 4} more cameras, in poses.json")
+    lines += lost_lines(result)
+    for other in result["other_models"]:
+        lines.append(
+            f"{other['folder']} holds a separate piece: {len(other['photos'])} photographs, {other['points']:,} points"
+        )
+    lines.append(f"look at {capture}/poses.png, then: gs2d train {shlex.quote(capture)} --out RUN")
+    for line in lines:
         console.say(line)
     console.result(result)
 

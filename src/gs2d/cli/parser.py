@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import difflib
 import itertools
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gs2d.cli.command_line import NAMES, Option, fields_of, options_of
+from gs2d.cli.command_line import NAMES, Option, options_of
 from gs2d.cli.commands import Common
 from gs2d.core.missing import path_hint
 from gs2d.pipeline.prepare.options import HowItRuns
@@ -57,18 +56,12 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parse(argv: Sequence[str]) -> Common:
-    """Return the command of a command line of at least one word.
-
-    Raises
-    ------
-    UsageError
-        If the command line is invalid.
-    """
+    """Return the command of a command line of at least one word. Raises UsageError if the command line is invalid."""
     name, *words = argv
     if name not in NAMES:
         raise UsageError(_with_help(_no_command(name, words), "gs2d --help"))
     try:
-        command: Common = _construct(NAMES[name], _field_values(name, words))
+        command: Common = NAMES[name](**_field_values(name, words))
     except UsageError as error:
         raise UsageError(_with_help(str(error), f"gs2d {name} --help")) from None
     if isinstance(command, HowItRuns) and command.resume and command.overwrite:
@@ -89,6 +82,7 @@ def _field_values(name: str, words: Sequence[str]) -> dict[str, Any]:
         raise UsageError(f"unexpected {rest[0]!r}: the command takes {takes}")
     values = {field: value for field, value in vars(parsed).items() if value not in (None, [])}
     values |= _settings(values.pop(_OVERRIDES, ()), options, trains)
+    values = {field: tuple(value) if isinstance(value, list) else value for field, value in values.items()}
     if missing := [option.usage for option in options if option.required and option.field not in values]:
         raise UsageError(f"gs2d {name} needs {' and '.join(missing)}")
     return values
@@ -113,18 +107,6 @@ def _settings(changes: Sequence[str], options: Sequence[Option], trains: bool) -
     return values
 
 
-def _construct(kind: type, values: Mapping[str, Any]) -> Any:
-    """Return a dataclass with these values, which are also those of its nested dataclasses."""
-    chosen = {}
-    for field, hint, _ in fields_of(kind):
-        if dataclasses.is_dataclass(hint):
-            chosen[field.name] = _construct(hint, values)
-        elif field.name in values:
-            value = values[field.name]
-            chosen[field.name] = tuple(value) if isinstance(value, list) else value
-    return kind(**chosen)
-
-
 def _normalised(words: Sequence[str], options: Sequence[Option]) -> list[str]:
     """Return the words with dashes in options (--schedule_scale), and the value of options that may omit it."""
     normalised = []
@@ -143,27 +125,20 @@ def _is_flag(word: str) -> bool:
 
 
 # -- paths -------------------------------------------------------------------------------------------------------------
-def check_inputs(options: Any) -> None:
+def check_inputs(command: Common) -> None:
     """Raise for an input path that does not exist; cheap, so that a misspelt path is reported at once."""
-    kind: type = type(options)
-    by_field = {option.field: option for option in options_of(kind)}
-    for field in dataclasses.fields(options):
-        value = getattr(options, field.name)
-        if dataclasses.is_dataclass(value):
-            check_inputs(value)
-        elif isinstance(value, Path) and field.name not in _OUTPUTS:
-            if field.name == "photos" and getattr(options, "resume", False):
-                continue  # not needed once the cameras are known
-            _check_exists(value, by_field[field.name])
-
-
-def _check_exists(path: Path, option: Option) -> None:
-    try:
-        path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        raise UsageError(f"expected {option.usage} at {path}, found nothing{path_hint(path)}") from None
-    except (OSError, ValueError):
-        pass  # reported by the reader of the path
+    for option in options_of(type(command)):
+        path = getattr(command, option.field)
+        if not isinstance(path, Path) or option.field in _OUTPUTS:
+            continue
+        if option.field == "photos" and getattr(command, "resume", False):
+            continue  # not needed once the cameras are known
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            raise UsageError(f"expected {option.usage} at {path}, found nothing{path_hint(path)}") from None
+        except (OSError, ValueError):
+            pass  # reported by the reader of the path
 
 
 # -- messages ----------------------------------------------------------------------------------------------------------

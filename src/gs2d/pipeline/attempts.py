@@ -34,7 +34,6 @@ def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[Non
         The file or section that is made.
     command : str or None
         Makes it later (:func:`again`); None: the same command with ``--resume``; "": nothing does.
-    on_event : callable
     """
     try:
         yield

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,20 +10,18 @@ import numpy as np
 
 from gs2d.config.protocols import get_protocol
 from gs2d.core.atomic_files import check_writable
-from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
 from gs2d.data import Scene, detect_format, load_scene
 from gs2d.data.scene import View
-from gs2d.data.subject_box import OBJECT
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.pipeline.finish.run_mesh import check_mesh_options, checked_mesh_file, extract_mesh
-from gs2d.pipeline.finish.run_subject import centers_inside, subject_in, subject_line, wants_subject
+from gs2d.pipeline.finish.run_subject import centers_inside, meshed_subject
 from gs2d.pipeline.finish.viewpoints import choose_viewpoints
-from gs2d.pipeline.in_memory import Trained
 from gs2d.pipeline.look.page import settings_without_run
 from gs2d.pipeline.prepare.limits import use_threads
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.open_capture import choose_backend, choose_protocol
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
@@ -45,6 +42,8 @@ def mesh_file(
 ) -> dict[str, Any]:
     """Mesh the splats of a file of any format; return the mesh file, counts and limits.
 
+    Raises RunError or DataError or ProtocolError if a file, the capture or an option is invalid.
+
     Parameters
     ----------
     splats_file : Path
@@ -53,11 +52,6 @@ def mesh_file(
         Mesh file.
     cameras : Path or None
         Capture in the frame of the splats; its training views are rendered. None: ``choose_viewpoints``.
-
-    Raises
-    ------
-    RunError, DataError, ProtocolError
-        If a file, the capture or an option is invalid.
     """
     if out is None:
         raise RunError("--splats needs --out FILE, the mesh to write")
@@ -74,13 +68,8 @@ def mesh_file(
         options = replace(options, refine=False)  # there are no photographs
     else:
         loaded, box = _photographed(splats, Path(cameras), on_event), None
-    subject = None
-    if wants_subject(loaded, options):
-        found = subject_in(
-            loaded, loaded.splats, options.subject_box or (None if box is None else box.ravel().tolist())
-        )
-        on_event(Notice(subject_line(found, meshed=True)))
-        subject = found if found.kind == OBJECT else None
+    near = None if box is None else box.ravel().tolist()
+    subject = meshed_subject(None, loaded, loaded.splats, options, on_event, box=near)
     return extract_mesh(loaded, loaded.splats, options, out, on_event, subject=subject)
 
 
@@ -107,19 +96,14 @@ def _around(splats: Splats, on_event: OnEvent) -> tuple[Trained, np.ndarray | No
     chosen = choose_viewpoints(splats, settings, backend)
     on_event(Notice(f"{len(chosen.cameras)} viewpoints {chosen.why}; --cameras CAPTURE sets them"))
     centers = np.stack([camera.center for camera in chosen.cameras])
+    image = np.zeros((chosen.cameras[0].height, chosen.cameras[0].width, 3), np.uint8)  # of all views
     scene = Scene(
         name="splats",
         format="",
-        train=_views(chosen.cameras),
+        train=tuple(View.from_arrays(f"view{n:03d}", camera, image) for n, camera in enumerate(chosen.cameras)),
         test=(),
         points=None,
         extent=camera_extent(chosen.cameras),
         bounds=np.stack([centers.min(axis=0), centers.max(axis=0)]),
     )
     return Trained(splats, scene, protocol, settings, backend), chosen.box
-
-
-def _views(cameras: Sequence[Camera]) -> tuple[View, ...]:
-    """Return views with the same empty image."""
-    image = np.zeros((cameras[0].height, cameras[0].width, 3), np.uint8)
-    return tuple(View.from_arrays(f"view{number:03d}", camera, image) for number, camera in enumerate(cameras))

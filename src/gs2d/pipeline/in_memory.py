@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -18,48 +18,21 @@ from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.core.text import printable
 from gs2d.data import Scene, load_scene
-from gs2d.data.subject_box import OBJECT
 from gs2d.errors import DataError, ProtocolError
 from gs2d.evaluation.image_metrics import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.finish.run_mesh import fused
-from gs2d.pipeline.finish.run_subject import subject_in, wants_subject
+from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.open_capture import capture_in_memory
 from gs2d.pipeline.prepare.options import MeshOptions, Training
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import recipe_of, resolve
-from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings
 from gs2d.training.events import Event, Notice, OnEvent, Progress, StageStarted, ignore
 from gs2d.training.trainer import Trainer, raster_settings
 
 __all__ = ["Trained", "evaluate", "extract_mesh", "train"]
-
-
-@dataclass(frozen=True, eq=False)
-class Trained:
-    """Trained splats with what scoring and meshing need.
-
-    Attributes
-    ----------
-    splats : Splats
-    scene : Scene
-        With refined cameras and learned appearance (``View.appearance``).
-    protocol : Protocol
-    settings : RasterSettings
-        The constants of the rasterizer in training: near, far, background.
-    backend : Backend
-    recipe : Recipe or None
-        As trained; None for splats from elsewhere.
-    """
-
-    splats: Splats
-    scene: Scene
-    protocol: Protocol
-    settings: RasterSettings
-    backend: Backend
-    recipe: Recipe | None = None
 
 
 def train(
@@ -234,10 +207,7 @@ def extract_mesh(
             raise ProtocolError(f"voxel is set twice, to {voxel} and by options to {options.voxel}; leave one out")
         options = replace(options, voxel=voxel)
     finished = _finished(trained, scene, protocol, backend, on_event)
-    subject = None
-    if wants_subject(finished, options):
-        found = subject_in(finished, finished.splats, options.subject_box)
-        subject = found if found.kind == OBJECT else None
+    subject = meshed_subject(None, finished, finished.splats, options, ignore)
     return fused(finished, finished.splats, options, on_event, subject=subject).mesh
 
 

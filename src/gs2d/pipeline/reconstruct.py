@@ -14,7 +14,7 @@ from gs2d.core.missing import suggestion
 from gs2d.data import detect_format
 from gs2d.data.masks import OFF
 from gs2d.errors import DataError, ProtocolError, RunError
-from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, remove_made
+from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, remove_made
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import attempted_file
 from gs2d.pipeline.finish.run_texture import PACKAGES as TEXTURE_PACKAGES
@@ -51,8 +51,8 @@ CAPTURE = "capture"
 
 def poses_options(options: ReconstructOptions) -> PosesOptions:
     """Return the options of ``gs2d poses``, which writes the capture into the run folder."""
-    estimation = values(PoseEstimation, options.finding)
-    if options.training.masked == OFF:
+    estimation = values(PoseEstimation, options)
+    if options.masked == OFF:
         estimation["match_masked"] = True
     return PosesOptions(
         photos=options.photos,
@@ -66,9 +66,9 @@ def poses_options(options: ReconstructOptions) -> PosesOptions:
 
 def train_options(options: ReconstructOptions) -> TrainOptions:
     """Return the options of ``gs2d train``."""
-    shared = {name: value for kind in (Effort, HowItRuns, Resources) for name, value in values(kind, options).items()}
-    training = values(Training, options.training)
-    return TrainOptions(scene=options.out / CAPTURE, format="colmap", **shared, **training)
+    kinds = (Training, Effort, HowItRuns, Resources)
+    shared = {name: value for kind in kinds for name, value in values(kind, options).items()}
+    return TrainOptions(scene=options.out / CAPTURE, format="colmap", **shared)
 
 
 def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunFolder:
@@ -163,18 +163,14 @@ def _check_photos(options: ReconstructOptions) -> None:
 @contextmanager
 def _claimed(out: Path) -> Iterator[None]:
     """Lock the run folder while cameras are estimated; remove it after a failure if it did not exist before."""
-    made, run = make_folder(out), RunFolder(out)
-    try:
-        with run.locked():
-            try:
-                yield
-            except BaseException:
-                if not is_run(out):
-                    run.file(LOCK).unlink(missing_ok=True)
-                raise
-    except BaseException:
-        remove_made(made)
-        raise
+    run = RunFolder(out, make_folder(out))
+    with run.locked():
+        try:
+            yield
+        except BaseException:
+            if not is_run(out):
+                run.discard()
+            raise
 
 
 def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from gs2d.pipeline.finish.scoring import evenly
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.finish.viewpoints import orbit_cameras
 from gs2d.pipeline.prepare.learned_views import photographed
-from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished, spare_photographs
 from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
@@ -181,9 +181,9 @@ def render_run(
     if options.width is not None:
         views = [(name, replace(view, camera=_at_width(view.camera, options.width))) for name, view in views]
     if out is not None:
-        _spare_photographs([out / f"{name}.png" for name, _ in views], "--out", loaded)
+        spare_photographs([out / f"{name}.png" for name, _ in views], "--out", loaded)
     if video is not None:
-        _spare_photographs([video], "--video", loaded)
+        spare_photographs([video], "--video", loaded)
     folder = out or run.file(RENDERS) / kind
     made = make_folder(folder)
     with run.locked() if out is None else contextlib.nullcontext():
@@ -255,11 +255,3 @@ def check_frames(options: RenderOptions) -> None:
             raise RunError("--video needs --orbit N, N >= 2")
         check_video(video, FPS, orbit)
         check_writable(video)
-
-
-def _spare_photographs(files: Sequence[Path], option: str, loaded: LoadedRun) -> None:
-    """Raise if an output would overwrite a photograph of the capture."""
-    images = {view.path.resolve() for view in loaded.scene.views if view.path is not None}
-    for file in files:
-        if file.resolve() in images:
-            raise RunError(f"{option} would overwrite the photograph {file}; choose another name")

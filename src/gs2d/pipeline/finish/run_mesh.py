@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -260,8 +261,9 @@ def fusion_frame(
         valid = valid * np.maximum(confidence(output), sky)
     past = sky if reach is None else sky | ~within_reach(reach, view.camera, depths)
     depths = np.where(past, np.float32(np.inf), depths)
-    color = surface_color(output, loaded).cpu().numpy()
-    return RenderedView(view.camera, depths, color, valid)
+    alpha, background = output.alpha[..., None], output.color.new_tensor(loaded.settings.background)
+    color = ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)  # without the background
+    return RenderedView(view.camera, depths, color.cpu().numpy(), valid)
 
 
 def confidence(output: RenderOutput) -> np.ndarray:
@@ -273,20 +275,11 @@ def confidence(output: RenderOutput) -> np.ndarray:
     return np.where(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy(), 1.0, SEVERAL)
 
 
-def surface_color(output: RenderOutput, loaded: RenderedScene) -> torch.Tensor:
-    """Return the colour without the background, [H, W, 3] in [0, 1]."""
-    alpha = output.alpha[..., None]
-    background = output.color.new_tensor(loaded.settings.background)
-    return ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)
-
-
 def checked_mesh_file(path: Path, out: Path, options: MeshOptions) -> Path:
     """Return the file of a mesh, .ply or .glb; ``path`` is the run or the folder of the splats.
 
-    Raises
-    ------
-    RunError, ProtocolError
-        If the name has another suffix, is that of the splats, or cannot hold levels of detail.
+    Raises RunError or ProtocolError if the name has another suffix, is that of the splats, or cannot hold levels of
+    detail.
     """
     glb = Path(out).suffix.lower() == ".glb"
     if options.lods > 1 and not glb:
@@ -333,12 +326,13 @@ def mesh_run(
     path, out = Path(path), None if out is None else Path(out)
     checked_mesh_file(path, path / MESH if out is None else out, options)
     run, loaded, splats = open_finished(path, threads, on_event)
-    if out is not None and out.resolve() != run.file(MESH).resolve():
+    own = run.file(MESH)
+    target = own if out is None or out.resolve() == own.resolve() else out
+    with run.locked() if target == own else nullcontext():
         subject = meshed_subject(run, loaded, splats, options, on_event)
-        return extract_mesh(loaded, splats, options, out, on_event, subject=subject)
-    with run.locked():
-        subject = meshed_subject(run, loaded, splats, options, on_event)
-        result = extract_mesh(loaded, splats, options, run.file(MESH), on_event, subject=subject)
+        result = extract_mesh(loaded, splats, options, target, on_event, subject=subject)
+        if target != own:
+            return result
         if run.metrics().get("surface"):  # scores of the previous mesh
             run.write_metrics({**run.metrics(), "surface": None})
             shutil.rmtree(run.file(SURFACE), ignore_errors=True)

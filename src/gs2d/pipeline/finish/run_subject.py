@@ -31,7 +31,7 @@ from gs2d.io.run_dir import SUBJECT, RunFolder
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.mesh_methods import MESH_METHODS
 from gs2d.pipeline.finish.trusted_depth import surface_reach
-from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene
+from gs2d.pipeline.prepare.loaded import RenderedScene
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.training.events import Notice, OnEvent
@@ -46,23 +46,17 @@ MAX_POINTS = 2000  # sparse points per camera
 
 
 def subject_of(
-    run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
+    run: RunFolder, loaded: RenderedScene, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
 ) -> Subject:
     """Return the subject of a run: ``box``, else that of ``subject.json``, else the one found; write it there.
+
+    Raises ProtocolError if the box is invalid, or the splats show no surface, RunError if there is no splat in the box,
+    DataError if ``subject.json`` is damaged.
 
     Parameters
     ----------
     box : sequence of 6 floats, optional
         x0 y0 z0 x1 y1 z1, world units.
-
-    Raises
-    ------
-    ProtocolError
-        If the box is invalid, or the splats show no surface.
-    RunError
-        If there is no splat in the box.
-    DataError
-        If ``subject.json`` is damaged.
     """
     known = read_subject(run.path) if box is None else None
     if known is not None:
@@ -85,43 +79,49 @@ def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | Non
 
 
 def meshed_subject(
-    run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent
+    run: RunFolder | None,
+    loaded: RenderedScene,
+    splats: Splats,
+    options: MeshOptions,
+    on_event: OnEvent,
+    *,
+    box: Sequence[float] | None = None,
 ) -> Subject | None:
-    """Find the subject of a run; return it if it is meshed, None if everything or another box is meshed."""
-    wanted = wants_subject(loaded, options)
-    subject = subject_of(run, loaded, splats, on_event, box=options.subject_box)
-    return subject if wanted and subject.kind == OBJECT else None
+    """Return the subject if it is meshed, None if everything or another box is meshed.
 
-
-def wants_subject(loaded: RenderedScene, options: MeshOptions) -> bool:
-    """Return whether the subject is meshed, if there is one; raise for options that exclude each other."""
-    box = options.subject_box
-    everything = not MESH_METHODS.get(options.method).bounded
+    Parameters
+    ----------
+    run : RunFolder or None
+        Remembers its subject, which is found even if it is not meshed.
+    box : sequence of 6 floats, optional
+        Without a run: the subject, unless ``options`` have one.
+    """
+    chosen = options.subject_box
     others = {
         **{"--bbox": options.bbox is not None, "--scene": options.whole_scene},
-        f"--method {options.method}": everything,
+        f"--method {options.method}": not MESH_METHODS.get(options.method).bounded,
     }
-    check_subject_box(box, others)
-    return box is not None or (loaded.protocol.fusion.subject and not any(others.values()))
+    check_subject_box(chosen, others)
+    wanted = chosen is not None or (loaded.protocol.fusion.subject and not any(others.values()))
+    if run is not None:
+        subject = subject_of(run, loaded, splats, on_event, box=chosen)
+    elif wanted:
+        subject = subject_in(loaded, splats, chosen or box)
+        on_event(Notice(subject_line(subject, meshed=True)))
+    return subject if wanted and subject.kind == OBJECT else None
 
 
 def centers_inside(splats: Splats, box: Sequence[float], option: str) -> Tensor:
     """Return which splats have their centres in a box, bool [N].
 
+    Raises DataError if the box is invalid, RunError if there is no splat in it.
+
     Parameters
     ----------
-    splats : Splats
     box : sequence of 6 floats
         x0 y0 z0 x1 y1 z1, world units; the faces belong to it.
     option : str
         Name of the box in errors.
-
-    Raises
-    ------
-    DataError
-        If the box is invalid.
-    RunError
-        If there is no splat in it.
     """
     low, high = torch.from_numpy(checked_box(box, option)).to(splats.means)
     inside = ((splats.means >= low) & (splats.means <= high)).all(dim=1)

@@ -34,7 +34,7 @@ from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.trusted_depth import usable_pixels
 from gs2d.pipeline.prepare.learned_views import as_scene
-from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished, spare_photographs
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
@@ -72,9 +72,7 @@ def texture_run(
         mesh_run(path, mesh_options, on_event, threads=threads)
         mesh_options = MeshOptions()
     run, loaded, splats = open_finished(path, threads, on_event)
-    for view in loaded.scene.views:
-        if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
-            raise RunError(f"--out {target} would overwrite the photograph {view.name}; choose another name")
+    spare_photographs(files, "--out", loaded)
     mesh = _mesh(run, loaded, splats, mesh_options, on_event)
     baked = textured_mesh(loaded, mesh, options, on_event)
     write_mesh(target, baked.mesh, up=up_direction([view.camera for view in loaded.scene.train]))

@@ -54,7 +54,6 @@ class ViewMeasures:
 
     Attributes
     ----------
-    name, split : str
     psnr : float or None
         dB, of 8-bit images.
     points, hidden : int or None
@@ -80,7 +79,6 @@ class Measures:
 
     Attributes
     ----------
-    views : tuple of ViewMeasures
     placed, count : int or None
         Photographs with a camera and all photographs, if ``gs2d poses`` made the capture.
     lost : tuple of str
@@ -311,11 +309,7 @@ def _some(names: Sequence[str]) -> str:
 def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> dict[str, Any] | None:
     """Judge a run, write ``verdict.json``, and return the verdict; without newly measured views the earlier one.
 
-    Raises
-    ------
-    RunError
-        If the views were scored but never measured.
-    DiskError
+    Raises RunError if the views were scored but never measured.
     """
     if collected.failure is not None:
         raise collected.failure

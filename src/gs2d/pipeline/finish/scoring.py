@@ -27,7 +27,6 @@ class RenderedPhotograph:
 
     Attributes
     ----------
-    view : View
     split : str
         "train", "test" or "".
     output : RenderOutput

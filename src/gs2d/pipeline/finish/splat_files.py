@@ -51,10 +51,7 @@ def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, An
 def checked_layout(path: Path, out: Path, layout: str | None = None) -> str:
     """Return the layout of the splat file ``out`` that is written from the run or file ``path``.
 
-    Raises
-    ------
-    RunError
-        If there is no such layout, ``out`` has another ending, or is a file that must not be replaced.
+    Raises RunError if there is no such layout, ``out`` has another ending, or is a file that must not be replaced.
     """
     layout = layout or layout_of(out)
     if layout is None:
@@ -83,11 +80,13 @@ def splats_of(path: Path, tell: Tell) -> Splats:
 def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str, Any]:
     """Edit the splats of a run, or write the edited splats of a run or a file to ``out``.
 
+    Raises RunError or DataError if the options contradict each other, the edit concerns no splat or leaves none, or a
+    file is damaged.
+
     Parameters
     ----------
     path : Path
         Run folder, or a file of flat splats, which needs ``out``.
-    options : EditOptions
     out : Path or None
         File to write, in the format of its ending; None: replace the splats of the run, undoably.
 
@@ -95,11 +94,6 @@ def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str,
     -------
     dict
         ``file``, ``splats`` and ``before`` (numbers of splats), ``notes``.
-
-    Raises
-    ------
-    RunError, DataError
-        If the options contradict each other, the edit concerns no splat or leaves none, or a file is damaged.
     """
     path, out = Path(path), None if out is None else Path(out)
     _check(path, options, out)

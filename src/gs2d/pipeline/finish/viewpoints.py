@@ -53,8 +53,6 @@ def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | No
 
     Parameters
     ----------
-    cameras : sequence of Camera
-    frames : int
     focus : ndarray [3], optional
         World units (default: the point nearest to the optical axes).
     """
@@ -116,7 +114,6 @@ class Viewpoints:
 
     Attributes
     ----------
-    cameras : tuple of Camera
     box : ndarray [2, 3] world units, or None
         Corners of the box of the subject that they surround; None in a room.
     why : str
@@ -134,12 +131,7 @@ def choose_viewpoints(splats: Splats, settings: RasterSettings, backend: Backend
     The subject is where the splats are densest. Cameras on a sphere around it look at its centre. If cameras in its
     middle see about as much, and things that are hidden from outside, it is a room, and cameras in its middle look
     outwards. A surface that is visible from both sides is an open sheet (a floor, a facade); it is seen from the side
-    that shows more.
-
-    Raises
-    ------
-    DataError
-        If no splat is opaque enough to be a surface, or all are in one point.
+    that shows more. Raises DataError if no splat is opaque enough to be a surface, or all are in one point.
     """
     solid = splats.rows(torch.sigmoid(splats.opacity_logits) > FAINT)
     if len(solid) == 0:

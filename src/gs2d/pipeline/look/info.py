@@ -40,13 +40,7 @@ def describe_capture(path: Path) -> dict[str, Any]:
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """Describe a file of splats, a mesh or points.
-
-    Raises
-    ------
-    DataError
-        If the file is none of these, or is broken.
-    """
+    """Describe a file of splats, a mesh or points. Raises DataError if the file is none of these, or is broken."""
     if path.suffix.lower() not in _OF_MODELS and not is_splat_file(path):
         remedy = suggestion(path, "run" if belongs_to_run(path) else "capture")
         raise DataError(f"{path} is no file of splats, mesh or points{remedy}")

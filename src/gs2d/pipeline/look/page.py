@@ -52,10 +52,8 @@ def page_run(
 
     Parameters
     ----------
-    path : Path
     out : Path or None
         None: ``scene.html`` in the run, or next to the file.
-    on_event : callable
     loaded : LoadedRun or None
         The run, if it is already loaded.
 
@@ -115,8 +113,6 @@ class PageContent:
 
     Attributes
     ----------
-    splats : Splats
-    scene : PageScene
     photographs : sequence of View
         Those of ``scene.views``, in order; empty if the capture is missing.
     run : RunFolder or None

@@ -90,20 +90,14 @@ def estimate(
 ) -> Estimate:
     """Estimate the training of a scene.
 
+    Raises DataError if the initial splats do not fit into memory.
+
     Parameters
     ----------
-    scene : Scene
-    recipe : Recipe
-    backend : Backend
     downscale : int
         Factor by which the photographs are smaller than their files.
     start : int, optional
         Initial number of splats, if known.
-
-    Raises
-    ------
-    DataError
-        If the initial splats do not fit into memory.
     """
     allowed = memory_budget()
     start = initial_splats(scene, recipe) if start is None else start

@@ -65,10 +65,7 @@ def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
 def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
     """Return a scene with its learned appearance; unchanged if the run learns none, or is unfinished.
 
-    Raises
-    ------
-    RunError
-        If the file is missing, damaged or of other photographs.
+    Raises RunError if the file is missing, damaged or of other photographs.
     """
     names = recipe.quantities.keys() - {"poses", "intrinsics"}
     if not names or not (run.file(LEARNED).exists() or run.file(SPLATS).exists()):
@@ -123,12 +120,10 @@ def matched_by_halves(
 
     Parameters
     ----------
-    view : View
     color, target : Tensor [H, W, 3]
         Rendering and photograph, over the background.
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
-    background : three floats
     """
     camera = replace(view, appearance={k: found for k, found in view.appearance.items() if k != "exposure"})
     color, cover = photographed(camera, color, background), over(view, color, background)
@@ -222,10 +217,7 @@ def camera_motion(original: Camera, now: Camera, focus: np.ndarray, extent: floa
 def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
     """Return a scene with the cameras of ``poses.json``; unchanged if the run refines none, or is unfinished.
 
-    Raises
-    ------
-    RunError
-        If the file is missing, damaged or of other photographs.
+    Raises RunError if the file is missing, damaged or of other photographs.
     """
     if not recipe.learns("poses") or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
         return scene

@@ -44,7 +44,6 @@ def check_memory(scene: Scene, downscale: int, *, on_host: bool) -> None:
 
     Parameters
     ----------
-    scene : Scene
     downscale : int
         Factor by which its photographs are smaller than their files.
     on_host : bool

@@ -4,39 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import json
-import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe, validate
 from gs2d.core.splats import Splats
-from gs2d.core.text import name_bytes
-from gs2d.data import Scene, View
+from gs2d.data import Scene
 from gs2d.data.known_captures import missing_lines
-from gs2d.data.masks import EMPTY
 from gs2d.errors import DataError, RunError
 from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
+from gs2d.pipeline.prepare.digest import scene_digest, with_priors
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_refined_poses
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_execution, check_options, resolve, schedule_scale_of
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
-from gs2d.pipeline.prepare.scene_part import TrainedPart
-from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.events import Notice, OnEvent, counted
+from gs2d.training.events import Notice, OnEvent
 from gs2d.training.trainer import TrainerOptions, raster_settings
-
-DECODE_THREADS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +38,6 @@ class LoadedRun:
 
     Attributes
     ----------
-    resolved : ResolvedRun
-    scene : Scene
-    backend : Backend
     init : Splats or None
         Initial splats; None: from points.
     options : TrainerOptions
@@ -102,27 +92,77 @@ class LoadedRun:
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
-class RenderedScene(typing.Protocol):
-    """What rendering the splats of a scene needs: a LoadedRun, or ``in_memory.Trained``."""
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """Trained splats with what scoring and meshing need.
 
-    @property
-    def scene(self) -> Scene:
-        """The views and points."""
+    Attributes
+    ----------
+    splats : Splats
+    scene : Scene
+        With refined cameras and learned appearance (``View.appearance``).
+    protocol : Protocol
+    settings : RasterSettings
+        The constants of the rasterizer in training: near, far, background.
+    backend : Backend
+    recipe : Recipe or None
+        As trained; None for splats from elsewhere.
+    """
 
-    @property
-    def protocol(self) -> Protocol:
-        """The protocol."""
+    splats: Splats
+    scene: Scene
+    protocol: Protocol
+    settings: RasterSettings
+    backend: Backend
+    recipe: Recipe | None = None
 
-    @property
-    def settings(self) -> RasterSettings:
-        """The constants of the rasterizer."""
 
-    @property
-    def backend(self) -> Backend:
-        """The rasterizer."""
+RenderedScene = LoadedRun | Trained
+"""A scene, and how its splats are rendered."""
 
 
 # -- before training ---------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainedPart:
+    """A part of a scene with its own recipe and protocol; only its splats are written.
+
+    Attributes
+    ----------
+    views : tuple of str
+        Names of the training views, without test views; (): the split of the capture.
+    extent : float or None
+        World units; None: that of the capture.
+    own : Splats or None
+        The splats that are trained; None: initialised from points.
+    options : TrainerOptions
+        The frozen splats around them, the region of a dense start, and given exposures.
+    digest : str or None
+        Hash of ``own`` and ``options``.
+    """
+
+    recipe: Recipe
+    protocol: Protocol
+    views: tuple[str, ...] = ()
+    extent: float | None = None
+    own: Splats | None = None
+    options: TrainerOptions = field(default_factory=TrainerOptions)
+    digest: str | None = None
+
+    def scene_of(self, scene: Scene) -> Scene:
+        """Return the scene with the views and the extent of the part."""
+        scene = scene if self.extent is None else replace(scene, extent=self.extent)
+        if not self.views:
+            return scene
+        by_name = {view.name: view for view in scene.train}
+        missing = [name for name in self.views if name not in by_name]
+        if missing:
+            raise DataError(
+                f"{scene.root} lacks the training view {missing[0]} of this part ({len(missing)} missing); restore the "
+                "capture, or use another --out"
+            )
+        return replace(scene, train=tuple(by_name[name] for name in self.views), test=())
+
+
 def prepare_run(
     options: TrainOptions, on_event: OnEvent, *, title: str = "", part: TrainedPart | None = None
 ) -> LoadedRun:
@@ -130,8 +170,6 @@ def prepare_run(
 
     Parameters
     ----------
-    options : TrainOptions
-    on_event : callable
     title : str
         Heading of the report; empty: the name of the capture.
     part : TrainedPart or None
@@ -186,55 +224,11 @@ def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
     return splats, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -> str:
-    """Decode every photograph and return a hash of the training input.
-
-    Raises
-    ------
-    DataError
-        If a photograph does not decode, or masks leave no pixel of any training view.
-    """
-    digest = hashlib.sha256()
-    empty: list[View] = []
-    train = set(map(id, scene.train))
-    for view in counted(scene.preload(DECODE_THREADS), "reading photographs", len(scene.views), on_event):
-        digest.update(name_bytes(f"{view.name} {'train' if id(view) in train else 'test'}"))
-        mask = view.alpha() if scene.masks.masked == EMPTY else view.mask() if uses_masks else None
-        empty += [view] if mask is not None and not mask.any() else []
-        for array in _arrays(view):
-            digest.update(f"{array.shape} {array.dtype}".encode())
-            digest.update(np.ascontiguousarray(array).data)
-    if empty:
-        what = f"the masks of {len(empty)} of {len(scene.views)} views leave no pixel, first {empty[0].name}"
-        if set(map(id, empty)) >= train:
-            raise DataError(f"{scene.root}: {what}; white = keep: are the masks inverted?")
-        on_event(Notice(f"{what}: these views are not used (white = keep)"))
-    if scene.points is not None:
-        digest.update(np.ascontiguousarray(scene.points.points).tobytes())
-        if scene.points.colors is not None:
-            digest.update(np.ascontiguousarray(scene.points.colors).tobytes())
-    digest.update(np.float64(scene.extent).tobytes() + np.ascontiguousarray(scene.bounds, np.float64).tobytes())
-    return digest.hexdigest()
-
-
-def _arrays(view: View) -> Iterator[np.ndarray]:
-    camera = view.camera
-    yield np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
-    yield camera.T_cam_world
-    yield view.image()
-    for mask in (view.mask(), view.object_mask()):
-        if mask is not None:
-            yield mask
-
-
 # -- a run on disk -----------------------------------------------------------------------------------------------------
 def reload_run(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> LoadedRun:
     """Load a run from its folder, with its refined cameras, to mesh, render or score it again.
 
-    Raises
-    ------
-    RunError, DataError
-        If the capture has moved or changed.
+    Raises RunError or DataError if the capture has moved or changed.
     """
     resolved = read_resolved(run)
     record = resolved.scene
@@ -253,13 +247,7 @@ def reload_run(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> L
 
 
 def finished_splats(run: RunFolder) -> Splats:
-    """Return the splats of a finished run.
-
-    Raises
-    ------
-    RunError
-        If the run is not finished, or the file is damaged.
-    """
+    """Return the splats of a finished run. Raises RunError if the run is not finished, or the file is damaged."""
     path = run.file(SPLATS)
     if not path.exists():
         raise RunError(f"{run.path} is not finished: no {SPLATS}; continue it with `gs2d train ... --resume`")
@@ -290,3 +278,11 @@ def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "the
     if out.resolve() == (path / SPLATS).resolve():
         raise RunError(f"--out {out} is the splats of the run, which must not change; choose another name")
     return out
+
+
+def spare_photographs(files: Iterable[Path], option: str, loaded: LoadedRun) -> None:
+    """Raise if an output would overwrite a photograph of the capture."""
+    images = {view.path.resolve() for view in loaded.scene.views if view.path is not None}
+    for file in files:
+        if file.resolve() in images:
+            raise RunError(f"{option} would overwrite the photograph {file}; choose another name")

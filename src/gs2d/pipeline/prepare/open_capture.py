@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from gs2d.config.protocols import Protocol, get_protocol, protocol_for
-from gs2d.config.recipe import Recipe
-from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.data import Scene, detect_format, load_scene
 from gs2d.data.known_captures import protocol_of
@@ -32,71 +29,46 @@ SHOWN_SKIPS = 3
 FEW = 24  # photographs found by `gs2d poses`; with fewer, all are needed for the surface
 
 
-# -- quality -----------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class QualityLevel:
-    """Iterations (None: all of the recipe) and approximate longer side of the images in px."""
+class QualityLevel(NamedTuple):
+    """Iterations and approximate longer side of the images in px; None: the whole recipe, full-size images."""
 
-    iterations: int | None
-    side: int
-
-    def schedule_scale(self, recipe: Recipe) -> float:
-        """Return the fraction of the recipe that is trained, at most 1."""
-        return 1.0 if self.iterations is None else min(1.0, self.iterations / max(1, recipe.iterations))
-
-    def downscale(self, cameras: Sequence[Camera]) -> int:
-        """Return the factor by which images shrink so that the largest has about this side."""
-        side = max(max(camera.width, camera.height) for camera in cameras)
-        return max(1, math.floor(side / self.side + 0.5))
+    iterations: int | None = None
+    side: int | None = None
 
 
+WHOLE = QualityLevel()
 _FULL = QualityLevel(None, 1600)  # the image size of the official code
-QUALITIES: Mapping[str, Mapping[str, QualityLevel]] = MappingProxyType(
-    {
-        "draft": {"cpu": QualityLevel(1_800, 400), "gpu": QualityLevel(6_000, 800)},
-        "normal": {"cpu": QualityLevel(6_000, 800), "gpu": QualityLevel(30_000, 1600)},
-        "full": {"cpu": _FULL, "gpu": _FULL},
-    }
-)
+QUALITIES = {  # of --quality, by the device that trains
+    "draft": {"cpu": QualityLevel(1_800, 400), "gpu": QualityLevel(6_000, 800)},
+    "normal": {"cpu": QualityLevel(6_000, 800), "gpu": QualityLevel(30_000, 1600)},
+    "full": {"cpu": _FULL, "gpu": _FULL},
+}
 
 
-def quality_level(name: str, *, is_data_set: bool, on_host: bool) -> QualityLevel | None:
-    """Return what a quality means; None: the whole recipe on full-size images.
-
-    Parameters
-    ----------
-    name : str
-    is_data_set : bool
-        Whether the capture belongs to a data set with a protocol of its own, for which "auto" is the whole recipe.
-    on_host : bool
-        Whether the CPU trains.
-    """
+def quality_level(name: str, *, is_data_set: bool, on_host: bool) -> QualityLevel:
+    """Return what a quality means; "auto" is the whole recipe for a data set with a protocol of its own."""
     if name == "auto" and is_data_set:
-        return None
+        return WHOLE
     return QUALITIES["normal" if name == "auto" else name]["cpu" if on_host else "gpu"]
 
 
-# -- the capture -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class OpenCapture:
     """A capture as a training sees it.
 
     Attributes
     ----------
-    scene : Scene
-    protocol : Protocol
-    backend : Backend
     downscale : int
         Factor by which the photographs are smaller than their files.
-    quality : QualityLevel or None
-        Training length, where the options do not set it; None: the whole recipe.
+    quality : QualityLevel
+        Training length, where the options do not set it.
     """
 
     scene: Scene
     protocol: Protocol
     backend: Backend
     downscale: int
-    quality: QualityLevel | None = None
+    quality: QualityLevel = WHOLE
 
 
 def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
@@ -176,18 +148,18 @@ def _load_shrunk(
     scene_format: str,
     protocol: Protocol,
     backend: Backend,
-    quality: QualityLevel | None,
+    quality: QualityLevel,
     on_event: OnEvent,
 ) -> tuple[int, Scene]:
     """Load a capture at its downscale: that of the options, of the resumed run, or by quality and memory.
 
-    Raises
-    ------
-    DataError
-        If training at the requested downscale, or at any, does not fit into memory.
+    Raises DataError if training at the requested downscale, or at any, does not fit into memory.
     """
     masks = Masks(options.masks, options.masked)
-    downscale = options.downscale or _downscale_of_resumed(options)
+    downscale = options.downscale
+    if downscale is None and options.resume and is_run(options.out):
+        begun = RunFolder(options.out).definition().get("downscale")
+        downscale = begun if isinstance(begun, int) and begun >= 1 else None
     notices: list[Event] = []
 
     def load(factor: int, *lines: str) -> Scene:
@@ -196,7 +168,8 @@ def _load_shrunk(
 
     scene = load(downscale or 1)
     if downscale is None:
-        downscale = 1 if quality is None else quality.downscale([view.camera for view in scene.views])
+        side = max(max(view.camera.width, view.camera.height) for view in scene.views)
+        downscale = 1 if quality.side is None else max(1, math.floor(side / quality.side + 0.5))
         scene = load(downscale) if downscale > 1 else scene
         fitting, need = least_downscale(scene, downscale, on_host=backend.on_host)
         if fitting is not None and fitting > downscale:
@@ -222,14 +195,6 @@ def placed_photographs(capture: Path | None) -> tuple[int | None, int | None, tu
         return int(data["placed"]), int(data["count"]), lost
     except (LookupError, TypeError, ValueError, OverflowError):
         return None, None, ()  # a file of this name by another program
-
-
-def _downscale_of_resumed(options: TrainOptions) -> int | None:
-    """Return the downscale of the run that is resumed; None: there is none, or it was not recorded."""
-    if not (options.resume and is_run(options.out)):
-        return None
-    begun = RunFolder(options.out).definition().get("downscale")
-    return begun if isinstance(begun, int) and begun >= 1 else None
 
 
 def _skipped_line(scene: Scene) -> str:

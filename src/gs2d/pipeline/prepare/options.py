@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -215,7 +215,7 @@ class PosesOptions(PoseEstimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions(Effort, Resources, HowItRuns):
+class ReconstructOptions(Training, PoseEstimation, Effort, Resources, HowItRuns):
     """Options of a reconstruction, from photographs to a mesh."""
 
     photos: Photos
@@ -224,10 +224,6 @@ class ReconstructOptions(Effort, Resources, HowItRuns):
     """Run folder to create. Photographs and cameras go to its sub-folder `capture`."""
     texture: bool = False
     """Also write mesh.glb, textured from the photographs."""
-    training: Training = field(default_factory=Training)
-    """As in `gs2d train`."""
-    finding: PoseEstimation = field(default_factory=PoseEstimation)
-    """As in `gs2d poses`."""
 
 
 # -- commands that need a finished run ---------------------------------------------------------------------------------

@@ -84,11 +84,7 @@ _SHOWN = 3
 def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, Any]:
     """Make a capture; return the contents of ``poses.json``, with the path of the capture as ``capture``.
 
-    Raises
-    ------
-    BackendError
-        If pycolmap is not installed.
-    DataError, RunError, DiskError
+    Raises BackendError if pycolmap is not installed.
     """
     started = time.monotonic()
     check_installed()
@@ -220,10 +216,7 @@ def _paths_in(photos: Path, on_event: OnEvent) -> list[Path]:
 def _frames_of(video: Video, work: Path, count: int, source: dict[str, Any], on_event: OnEvent) -> list[Path]:
     """Extract the sharpest frames of a video, or return those of an interrupted search.
 
-    Raises
-    ------
-    DataError
-        If the video does not decode, or has too few frames.
+    Raises DataError if the video does not decode, or has too few frames.
     """
     folder = work / FRAMES
     if is_of(work, "photographs", source) and folder.is_dir():
@@ -299,12 +292,8 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
 def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list[Position | None], str]:
     """Return the position of each photograph in a local frame, from a list or from EXIF, and a note.
 
-    Unknown positions are None. Heights are 0 unless all are known.
-
-    Raises
-    ------
-    DataError
-        If the list cannot be read, or names none of the photographs.
+    Unknown positions are None. Heights are 0 unless all are known. Raises DataError if the list cannot be read, or
+    names none of the photographs.
     """
     labels = [photo.label for photo in photos]
     if listed is None:
@@ -369,10 +358,7 @@ def _read_models(
 ) -> tuple[list[SfmModel], dict[str, Any]]:
     """Return the models that COLMAP found, largest first, and the contents of ``poses.json``.
 
-    Raises
-    ------
-    DataError
-        If no photograph was placed.
+    Raises DataError if no photograph was placed.
     """
     models = [read_model(Path(request.output) / str(i), done) for i, done in enumerate(solved.models)]
     facts = read_facts(Path(request.database))

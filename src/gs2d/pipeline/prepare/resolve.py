@@ -55,8 +55,6 @@ def build_recipe(
 
     Parameters
     ----------
-    training : Training
-    seed : int
     schedule_scale : float
         Fraction of the recipe's iterations.
     iterations : int, optional
@@ -115,10 +113,7 @@ def check_execution(options: TrainOptions) -> None:
 def checkpoint_interval(every: str | int) -> tuple[int | None, float | None]:
     """Return the iterations and the seconds between checkpoints, one of them None, of ``--checkpoint-every``.
 
-    Raises
-    ------
-    RecipeError
-        If it is neither a whole number of iterations nor a time such as 90s or 10m.
+    Raises RecipeError if it is neither a whole number of iterations nor a time such as 90s or 10m.
     """
     text = str(every)
     number = int(text[:-1] if text[-1:] in ("s", "m") else text) if re.fullmatch(r"[0-9]{1,12}[sm]?", text) else 0
@@ -131,7 +126,8 @@ def schedule_scale_of(options: TrainOptions, capture: OpenCapture) -> float:
     """Return the trained fraction of the recipe: that of the options, else by quality."""
     if options.schedule_scale is not None:
         return options.schedule_scale
-    return 1.0 if capture.quality is None else capture.quality.schedule_scale(recipe_of(options.recipe))
+    iterations = capture.quality.iterations
+    return 1.0 if iterations is None else min(1.0, iterations / max(1, recipe_of(options.recipe).iterations))
 
 
 def resolve(
@@ -147,9 +143,6 @@ def resolve(
 
     Parameters
     ----------
-    training : Training
-    capture : OpenCapture
-    on_event : callable
     seed, schedule_scale, iterations
         As for :func:`build_recipe`.
     """

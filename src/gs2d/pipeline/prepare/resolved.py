@@ -25,17 +25,14 @@ class CaptureRecord:
 
     Attributes
     ----------
-    name : str
     path : Path
         Absolute.
-    format : str
     train, test : int
         Number of views.
     extent : float
         World units.
     skipped : tuple of str
         Photographs that were skipped, with the reason.
-    masks : Masks
     digest : str
         Hash of all decoded images, masks, cameras, points and priors.
     """
@@ -87,11 +84,8 @@ class ResolvedRun:
     ----------
     recipe : Recipe
         As trained, with its seed.
-    protocol : Protocol
-    scene : CaptureRecord
     downscale : int
         Factor by which the photographs are smaller than their files.
-    raster : RasterSettings
     backend : mapping
         What determines its results (``Backend.facts``).
     schedule_scale : float
@@ -102,7 +96,6 @@ class ResolvedRun:
         Hash of the file of initial splats.
     part : str or None
         Hash of the initial state of a part of a scene.
-    execution : Execution
     """
 
     recipe: Recipe
@@ -141,13 +134,7 @@ class ResolvedRun:
 
 
 def read_resolved(run: RunFolder) -> ResolvedRun:
-    """Return the run that ``run.json`` holds.
-
-    Raises
-    ------
-    RunError
-        If another version wrote it, or it was edited.
-    """
+    """Return the run that ``run.json`` holds. Raises RunError if another version wrote it, or it was edited."""
     data = run.definition()
     known = {entry.name: data[entry.name] for entry in fields(ResolvedRun) if entry.name in data}
     try:

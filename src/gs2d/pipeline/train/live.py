@@ -31,13 +31,7 @@ MAX_FRACTION = 0.03  # of the time of one thread, for copying and packing
 
 
 class Live:
-    """Serves the page of a training.
-
-    Raises
-    ------
-    BackendError
-        If the port is taken.
-    """
+    """Serves the page of a training. Raises BackendError if the port is taken."""
 
     def __init__(self, loaded: LoadedRun, on_event: OnEvent) -> None:
         self._forward = on_event

@@ -37,15 +37,12 @@ GIB = 2**30
 def connected(backend: str) -> Iterator[OneProcess]:
     """Connect to the other processes, if the environment defines any.
 
+    Raises BackendError if a process has no GPU, or torch was built without ``torch.distributed``.
+
     Parameters
     ----------
     backend : str
         The requested backend: unless it is of the CPU, each process uses a GPU of its own.
-
-    Raises
-    ------
-    BackendError
-        If a process has no GPU, or torch was built without ``torch.distributed``.
     """
     place = process_rank()
     if place.size == 1:
@@ -107,12 +104,7 @@ def lead(loaded: LoadedRun, together: OneProcess, on_event: OnEvent) -> LoadedRu
 def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
     """Train along with process 0, to the last iteration.
 
-    Raises
-    ------
-    RunError
-        If this process would train something else.
-    LostContactError
-        If process 0 has ended.
+    Raises RunError if this process would train something else, LostContactError if process 0 has ended.
     """
     sent: dict[str, Any] = together.tell({})
     loaded = prepare_run(replace(options, scene=Path(sent["scene"])), ignore)

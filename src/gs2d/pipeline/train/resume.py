@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,41 +24,27 @@ from gs2d.training.resumable import check_resumable
 from gs2d.training.state import TrainState
 
 
-@dataclass(frozen=True, eq=False)
-class ResumePoint:
-    """Where training starts.
-
-    Attributes
-    ----------
-    state : TrainState or None
-        None: from nothing.
-    seconds : float
-        Training time already spent in the current stage.
-    """
-
-    state: TrainState | None = None
-    seconds: float = 0.0
-
-
-def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
+def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> tuple[TrainState | None, float]:
     """Return the furthest valid start; log and metrics are cut to it.
 
-    Raises
-    ------
-    RunError
-        If no checkpoint is readable.
+    Raises RunError if no checkpoint is readable.
+
+    Returns
+    -------
+    (TrainState or None, float)
+        None: from nothing. The seconds of training already spent in the current stage.
     """
     cache = loaded.resolved.execution.cache
     if run.checkpoints():
         return _resume(run, loaded, on_event)
     run.events.cut(0)
-    if cache is not None and (start := _from_cache(run, loaded, cache, on_event)) is not None:
-        return start
+    if cache is not None and (state := _from_cache(run, loaded, cache, on_event)) is not None:
+        return state, 0.0
     run.write_metrics({"stages": [], "surface": None})
-    return ResumePoint()
+    return None, 0.0
 
 
-def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
+def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> tuple[TrainState, float]:
     for checkpoint in reversed(run.checkpoints()):
         try:
             payload = _read(checkpoint.path)
@@ -74,7 +59,7 @@ def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint
             kept |= {name: metrics[name] for name in ("surface", "mesh") if name in metrics}
         run.write_metrics({"stages": metrics["stages"][:finished], **kept})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
-        return ResumePoint(state, payload["seconds"])
+        return state, payload["seconds"]
     raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
 
 
@@ -114,7 +99,7 @@ def _cache_file(folder: Path, key: str) -> Path:
     return folder / f"{key[:32]}.pt"
 
 
-def _from_cache(run: RunFolder, loaded: LoadedRun, folder: Path, on_event: OnEvent) -> ResumePoint | None:
+def _from_cache(run: RunFolder, loaded: LoadedRun, folder: Path, on_event: OnEvent) -> TrainState | None:
     """Copy the finished stages of another run into this one, as far as the cache has them; delete damaged files."""
     sweep(folder)
     for index, stage in reversed(list(enumerate(loaded.recipe.stages))):
@@ -133,7 +118,7 @@ def _from_cache(run: RunFolder, loaded: LoadedRun, folder: Path, on_event: OnEve
         run.write_metrics({"stages": metrics, "surface": None})
         run.save_checkpoint(index, stage.name, None, {k: v for k, v in payload.items() if k != "events_bytes"})
         on_event(Notice(f"stages up to {stage.name!r} are reused from {path}"))
-        return ResumePoint(state)
+        return state
     return None
 
 

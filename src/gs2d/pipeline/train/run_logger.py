@@ -1,32 +1,42 @@
-"""Listen to the trainer: write the log and checkpoints, have stages scored, report progress, stop at signals."""
+"""Listen to the trainer: write the log, checkpoints and results of stages, report progress, stop at signals."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict
 from typing import Any
 
 from gs2d.config.recipe import Stage
+from gs2d.data import Scene
 from gs2d.errors import DivergedError, Gs2dError
-from gs2d.io.run_dir import RunFolder
+from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
+from gs2d.io.splat_ply import write_splats
+from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
-from gs2d.pipeline.finish.scoring import peak_memory
+from gs2d.pipeline.finish.scoring import (
+    mean_psnr,
+    peak_memory,
+    score_views,
+    split_metrics,
+)
+from gs2d.pipeline.prepare.learned_views import write_appearance, write_poses
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import checkpoint_interval
 from gs2d.pipeline.train.interruption import HeldSignals
-from gs2d.pipeline.train.resume import ResumePoint
-from gs2d.pipeline.train.stage_results import StageResults
+from gs2d.pipeline.train.resume import put_in_cache
 from gs2d.training import events
-from gs2d.training.events import Notice, OnEvent, Phase, Step
+from gs2d.training.events import Notice, OnEvent, Phase, StageScored, Step
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 
 LOG_LINES = 300  # progress lines per stage
-PROBES = 30  # times per stage at which the probe views are scored for the PSNR curve
+PROBES, PROBE_VIEWS = 30, 4  # times per stage at which views are scored for the PSNR curve, and how many
 REPORT_EVERY, REPORT_EVERY_ON_GPU = 10, 50  # iterations between progress events, for which the host waits for a GPU
 
 
@@ -60,11 +70,8 @@ class RunLogger:
 
     Parameters
     ----------
-    run : RunFolder
-    loaded : LoadedRun
-    trainer : Trainer
-    start : ResumePoint
-    on_event : callable
+    seconds : float
+        Training time already spent in the current stage.
     collected : Collector or None
         Measures every view of the finished splats.
     """
@@ -74,15 +81,16 @@ class RunLogger:
         run: RunFolder,
         loaded: LoadedRun,
         trainer: Trainer,
-        start: ResumePoint,
+        seconds: float,
         on_event: OnEvent,
         collected: Collector | None = None,
     ) -> None:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
-        self._results = StageResults(run, loaded, trainer, on_event, collected)
+        self._collected = collected
+        self._predicted: tuple[tuple[int, int], Scene] | None = None  # with its stage and step
         self._progress_every = progress_every(loaded)
         self._checkpoint_interval = checkpoint_interval(loaded.resolved.execution.checkpoint_every)
-        self._clock = StageClock(start.seconds)
+        self._clock = StageClock(seconds)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self.psnr: float | None = None  # of the probe views
         self._signals = HeldSignals()
@@ -93,7 +101,7 @@ class RunLogger:
         state = self._state
         if state.step == 0 and not state.entered:
             if state.stage > 0:
-                self._results.take_over(state.stage - 1, self._facts())
+                self._take_over(state.stage - 1, self._facts())
             self._reset_stage()
         self._saved_iteration = state.step
         if state.processes and state.processes[-1][:2] == (state.stage, state.step):
@@ -163,7 +171,7 @@ class RunLogger:
             extra: dict[str, Any] = {"total_iteration": total, "mean_area": event.mean_k_a}
             with self._clock.paused():
                 if last or self._due(event.iteration, event.iterations, PROBES):
-                    psnr = self._results.probe_psnr()
+                    psnr = self._probe_psnr()
                     if psnr is not None:
                         self.psnr = extra["psnr"] = psnr
             self._log(event, **extra)
@@ -200,19 +208,114 @@ class RunLogger:
 
     def _finish_stage(self, index: int) -> None:
         self._save(index, None)
-        stages = self._loaded.recipe.stages
-        if index == len(stages) - 1:
-            self._results.write_splats()
+        if self._is_last(index):
+            self._write_splats()
         self._signals.release()
         release_buffers()  # scoring has its own
-        self._results.score(index, self._facts())
-        if index + 1 < len(stages):
+        self.score(index, self._facts())
+        if not self._is_last(index):
             self._phase()
+
+    # -- results of stages ---------------------------------------------------------------------------------------------
+    def _probe_psnr(self) -> float | None:
+        """Return the mean PSNR of a few fixed views, test views if there are any."""
+        # Exposures are predicted from neighbours only: measuring brightness would render every photograph.
+        scene = with_predicted(self._trainer.scene_now())
+        probes = scene.test or scene.train
+        probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
+        return mean_psnr(self._trainer.drawn, probes, self._loaded.settings, self._loaded.backend)
+
+    def score(self, index: int, facts: Mapping[str, Any]) -> None:
+        """Score and draw a finished stage; ``facts`` go into its entry. After the last stage, errors are reported."""
+        with self._attempted_at_end(index):
+            self._score_stage(index, facts)
+
+    def _take_over(self, index: int, facts: Mapping[str, Any]) -> None:
+        """Draw a stage of another run or process, and score it if its scores or measures are missing."""
+        stages = self._run.metrics()["stages"]
+        if self._is_last(index):
+            self._write_splats()
+        unseen = self._collected is not None and not self._run.file(VERDICT).exists()
+        with self._attempted_at_end(index):
+            if len(stages) <= index:
+                self._score_stage(index, facts)
+            elif self._is_last(index) and unseen:
+                self._score_stage(index, {**facts, **stages[-1]})
+            else:
+                self._draw(self._stage(index).name)
+
+    def _write_splats(self) -> None:
+        """Write the splats, refined cameras and learned appearance, before anything that could fail uses them."""
+        with attempted("refined cameras and exposures", None, self._on_event):
+            now = self._trainer.scene_now()
+            write_poses(self._run, self._loaded.scene, now, self._on_event)
+            write_appearance(self._run, now, self._on_event)
+        write_splats(self._run.file(SPLATS), self._trainer.splats)
+
+    def _attempted_at_end(self, index: int) -> AbstractContextManager[None]:
+        """Report errors after the last stage; raise them before."""
+        if not self._is_last(index):
+            return nullcontext()
+        command = again("evaluate", self._run.path)
+        return attempted(f"scores of stage {self._stage(index).name}", command, self._on_event)
+
+    def _score_stage(self, index: int, facts: Mapping[str, Any]) -> None:
+        """Score and draw a finished stage, write its entry of ``metrics.json``, put it into the cache."""
+        stage, last, splats = self._stage(index), self._is_last(index), self._trainer.splats
+        entry: dict[str, Any] = {
+            "name": stage.name,
+            "iterations": stage.iterations,
+            "splats": len(splats),
+            "bytes": splats.nbytes,
+            **facts,
+        }
+        collected = self._collected if last else None
+        for split in ("train", "test"):
+            entry |= {split: None, f"{split}_reason": "its views could not be scored"}
+            with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
+                scene, loaded = self._shown_scene(), self._loaded
+                scores = score_views(
+                    self._trainer.drawn,
+                    scene.train if split == "train" else scene.test,
+                    loaded.settings,
+                    loaded.backend,
+                    self._on_event,
+                    split=split,
+                    visitors=[] if collected is None else [collected.visit],
+                )
+                del entry[f"{split}_reason"]
+                entry |= split_metrics(scores, split)
+        entry |= {} if collected is None else collected.transparent()
+        self._draw(stage.name)
+        stages = [*self._run.metrics()["stages"][:index], entry]
+        self._run.write_metrics({"stages": stages, "surface": None})
+        cache = self._loaded.resolved.execution.cache
+        if cache is not None:
+            saved = next(c for c in self._run.checkpoints() if c.stage_index == index and c.iteration is None)
+            put_in_cache(cache, self._run, index, load_tensors(saved.path))
+        self._on_event(StageScored(entry))
+
+    def _draw(self, stage: str) -> None:
+        drawn, state = self._trainer.drawn, self._trainer.state
+        with attempted(f"images of stage {stage}", None, self._on_event):
+            group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # no frozen splats
+            draw_stage(self._run, self._loaded, choose_views(self._shown_scene()), stage, drawn, group)
+
+    def _shown_scene(self) -> Scene:
+        """Return the scene with its learned appearance, and predicted exposures of its test views."""
+        at = (self._trainer.state.stage, self._trainer.state.step)
+        if self._predicted is None or self._predicted[0] != at:
+            brightness = metered(self._trainer.drawn, self._loaded.settings, self._loaded.backend)
+            self._predicted = (at, with_predicted(self._trainer.scene_now(), brightness))
+        return self._predicted[1]
 
     # -- helpers -------------------------------------------------------------------------------------------------------
     @property
     def _state(self) -> TrainState:
         return self._trainer.state
+
+    def _is_last(self, index: int) -> bool:
+        return index == len(self._loaded.recipe.stages) - 1
 
     def _stage(self, index: int) -> Stage:
         return self._loaded.recipe.stages[index]

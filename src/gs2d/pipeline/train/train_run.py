@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 
 from gs2d.core.memory import hold
@@ -31,16 +31,16 @@ from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
 from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
-from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
+from gs2d.pipeline.prepare.loaded import LoadedRun, TrainedPart, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.resolved import check_same_run
-from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
-from gs2d.pipeline.train.resume import ResumePoint, choose_start
+from gs2d.pipeline.train.resume import choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, TrainingEvent, ignore
-from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
+from gs2d.training.parallel import ManyProcesses, OneProcess
+from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from gs2d.viewer.page_server import free_port
 
@@ -56,11 +56,11 @@ def train(
     """Train a run and write splats, mesh, metrics, page and report.
 
     A run that fails before its first checkpoint leaves nothing behind. One that is interrupted later can be resumed,
-    with a byte-identical ``splats.ply``.
+    with a byte-identical ``splats.ply``. Raises Gs2dError if options, capture or machine do not allow the run; the
+    message says what to do.
 
     Parameters
     ----------
-    options : TrainOptions
     on_event : callable
         Receives :mod:`gs2d.training.events`.
     title : str
@@ -74,11 +74,6 @@ def train(
     -------
     RunFolder
         The finished run.
-
-    Raises
-    ------
-    Gs2dError
-        If options, capture or machine do not allow the run; the message says what to do.
     """
     with connected(options.backend) as together:
         use_threads(options.threads, together.place.local_size)
@@ -97,7 +92,8 @@ def train(
         if options.overwrite and options.cache is not None:  # before the old run is deleted
             remove_made(make_folder(options.cache))
         run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
-        with run.locked(), discard_on_failure(run), watched(loaded, on_event) as live:
+        page = nullcontext() if options.viewer is None else closing(Live(loaded, on_event))
+        with run.locked(), discard_on_failure(run), page as live:
             tell = on_event if live is None else live.on_event
             if options.cache is not None:  # an unusable folder fails here, not after the first stage
                 run.made += make_folder(options.cache)
@@ -117,7 +113,7 @@ def train(
                 run.write_definition(loaded.resolved.to_json())
             loaded = lead(loaded, together, tell)
             start = choose_start(run, loaded, tell)
-            if start.state is None:
+            if start[0] is None:
                 tell(Notice(_training_line(loaded)))
                 if part is None:
                     known = None if loaded.init is None else len(loaded.init)
@@ -129,28 +125,12 @@ def train(
                     if isinstance(event, Notice) and event.detail:
                         run.events.append({"kind": Notice.kind, "text": event.text})
             hold()
-            if part is not None:
-                train_stages(run, loaded, start, tell, live=live)
-                release(loaded.scene)
-                return run
-            collected = Collector(loaded.scene)
+            collected = Collector(loaded.scene) if part is None else None
             splats, now = train_stages(run, loaded, start, tell, collected, together, live)
             release(loaded.scene)  # before the volume of the mesh
-            finish(run, replace(loaded, scene=now), splats, tell, collected)
+            if collected is not None:
+                finish(run, replace(loaded, scene=now), splats, tell, collected)
         return run
-
-
-@contextmanager
-def watched(loaded: LoadedRun, on_event: OnEvent) -> Iterator[Live | None]:
-    """Serve the page of a training while it runs, with ``--viewer``."""
-    if loaded.resolved.execution.viewer is None:
-        yield None
-        return
-    live = Live(loaded, on_event)
-    try:
-        yield live
-    finally:
-        live.close()
 
 
 def check_viewer(options: TrainOptions) -> None:
@@ -173,15 +153,20 @@ def discard_on_failure(run: RunFolder) -> Iterator[None]:
 def train_stages(
     run: RunFolder,
     loaded: LoadedRun,
-    start: ResumePoint,
+    start: tuple[TrainState | None, float],
     on_event: OnEvent,
-    collected: Collector | None = None,
-    together: OneProcess = ONE_PROCESS,
-    live: Live | None = None,
+    collected: Collector | None,
+    together: OneProcess,
+    live: Live | None,
 ) -> tuple[Splats, Scene]:
-    """Train from ``start`` to the end of the last stage; return the splats and the scene with its refined cameras.
+    """Train from ``start`` (:func:`choose_start`) to the end of the last stage.
 
     The splats are written before they are scored. ``collected`` measures every view of the finished splats.
+
+    Returns
+    -------
+    (Splats, Scene)
+        The scene has its refined cameras.
     """
 
     def listen(event: TrainingEvent) -> None:
@@ -191,14 +176,15 @@ def train_stages(
         if isinstance(event, Progress):  # on a GPU, the only event at which no work is queued
             recorder.stop_if_requested()
 
+    state, seconds = start
     trainer = Trainer(
         loaded.scene,
         loaded.recipe,
         loaded.protocol,
         backend=loaded.backend,
         on_event=listen,
-        state=start.state,
-        init=loaded.init if start.state is None else None,
+        state=state,
+        init=loaded.init if state is None else None,
         options=replace(
             loaded.options,
             between=lambda: recorder.stop_if_requested(),
@@ -206,7 +192,7 @@ def train_stages(
             processes=together,
         ),
     )
-    recorder = RunLogger(run, loaded, trainer, start, on_event, collected)
+    recorder = RunLogger(run, loaded, trainer, seconds, on_event, collected)
     recorder.begin()
     with recorder.ending_well():
         trainer.run()
