@@ -234,7 +234,7 @@ def score_run(path: Path) -> dict[str, Any]:
         "train": scores(scene.train),
         "hidden": hidden_fraction(job, splats),
         "splats": len(splats),
-        "downscale": job.downscale,
+        "downscale": job.resolved.downscale,
         "pixels": [job.scene.views[0].camera.width, job.scene.views[0].camera.height],
     }
 

@@ -129,8 +129,8 @@ def main() -> None:
     arguments = parser.parse_args()
     run = open_run(arguments.run)
     job, mesh = reload_run(run, lambda _event: None), read_mesh(run.file(MESH))
-    shrink = arguments.downscale or job.downscale
-    if shrink != job.downscale and job.scene.root is not None:
+    shrink = arguments.downscale or job.resolved.downscale
+    if shrink != job.resolved.downscale and job.scene.root is not None:
         scene = read_scene(job.scene.root, job.scene.format, shrink, job.protocol, lambda _event: None)
         job = replace(job, scene=scene, resolved=replace(job.resolved, downscale=shrink))
     views = job.scene.test

@@ -43,7 +43,7 @@ def _names() -> Iterator[str]:
 def _command(name: str, shared: set[type]) -> list[str]:
     """Return a command: how it is called, what it does, its own options, and where the others are."""
     options = options_of(NAMES[name])
-    needed = sorted((o for o in options if o.required or o.positional), key=lambda o: not o.positional)
+    needed = sorted((o for o in options if o.required or o.mark.positional), key=lambda o: not o.mark.positional)
     usage = " ".join(o.usage if o.required else f"[{o.usage}]" for o in needed)
     lines = [f"### gs2d {name}", "", "```text", f"gs2d {name} {usage} [OPTIONS]".replace("  ", " "), "```", ""]
     lines += [_plain(about(NAMES[name])), "", *_explained(_arguments_first(options, shared))]
@@ -56,7 +56,7 @@ def _command(name: str, shared: set[type]) -> list[str]:
 
 def _arguments_first(options: Iterable[Option], shared: set[type]) -> list[Option]:
     """Return a command's own options, what stands alone on a command line before what has a name."""
-    return sorted((o for o in options if o.owner not in shared), key=lambda o: not o.positional)
+    return sorted((o for o in options if o.owner not in shared), key=lambda o: not o.mark.positional)
 
 
 def _explained(options: list[Option]) -> list[str]:

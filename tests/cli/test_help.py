@@ -92,7 +92,8 @@ def test_every_option_is_parsed_and_fills_its_field() -> None:
         options = options_of(command)
         for option in options:
             needed = sorted(
-                (o for o in options if o.required or o.positional or o is option), key=lambda o: not o.positional
+                (o for o in options if o.required or o.mark.positional or o is option),
+                key=lambda o: not o.mark.positional,
             )
             parsed = parse([name, *(word for other in needed for word in written(other))])
             assert option.default not in values_of(parsed, option.field), option

@@ -87,7 +87,7 @@ def test_a_killed_edit_leaves_the_splats_and_nothing_to_undo(copy: RunFolder, mo
     for link in (os.link, stop_link):
         with monkeypatch.context() as patch:
             patch.setattr(os, "link", link)
-            patch.setattr(module, "write_splats", stop)
+            patch.setattr(module.splat_ply, "write_splats", stop)
             with pytest.raises(KeyboardInterrupt):
                 edit(copy.path, EditOptions(keep_box=BOX))
         assert copy.file("splats.ply").read_bytes() == before

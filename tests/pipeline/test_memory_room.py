@@ -56,7 +56,7 @@ def test_photographs_shrink_to_fit_into_memory_by_default(tmp_path: Path, monkey
     heard: list[Any] = []
     mine = options(capture, tmp_path / "run")
     job = prepare_run(mine, heard.append)
-    assert (job.downscale, job.scene.train[0].camera.width) == (2, 12)
+    assert (job.resolved.downscale, job.scene.train[0].camera.width) == (2, 12)
     notices = [event.text for event in heard if isinstance(event, Notice)]
     (told,) = [text for text in notices if "megapixels" in text]
     assert told.startswith("photographs of up to 0.000576 megapixels need about")
@@ -70,5 +70,5 @@ def test_a_resumed_run_keeps_its_downscale(tmp_path: Path, monkeypatch: pytest.M
     capture = write_capture(tmp_path / "ball", train=3, test=1, size=24)
     mine = options(capture, tmp_path / "run", schedule_scale=0.0002)
     train(replace(mine, downscale=2))
-    assert prepare_run(replace(mine, resume=True), lambda _event: None).downscale == 2
-    assert prepare_run(replace(mine, resume=True, downscale=1), lambda _event: None).downscale == 1
+    assert prepare_run(replace(mine, resume=True), lambda _event: None).resolved.downscale == 2
+    assert prepare_run(replace(mine, resume=True, downscale=1), lambda _event: None).resolved.downscale == 1

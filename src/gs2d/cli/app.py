@@ -20,14 +20,7 @@ from typing import NoReturn
 
 import gs2d
 from gs2d.cli.command_line import NAMES
-from gs2d.cli.commands import (
-    COMMANDS,
-    Common,
-    DoctorCommand,
-    InfoCommand,
-    RecipesCommand,
-    TrainCommand,
-)
+from gs2d.cli.commands import COMMANDS, Common, DoctorCommand, InfoCommand, RecipesCommand, TrainCommand
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
@@ -76,7 +69,10 @@ def run(argv: Sequence[str]) -> int:
         return _report_missing(console, argv, command)
     except KeyboardInterrupt:
         console.close()
-        return _interrupted(argv, command) if process_rank().leads else INTERRUPTED
+        if process_rank().leads:
+            line = f"interrupted; resume with: {_resumed(argv)}" if isinstance(command, HowItRuns) else "interrupted"
+            _print_error(line)
+        return INTERRUPTED
     except BrokenPipeError:  # `gs2d ... | head`
         _drop_stdout()
         return PIPE_CLOSED
@@ -202,10 +198,3 @@ def _resumed(argv: Sequence[str]) -> str:
     """Return the command line that continues this one."""
     words = [word for word in argv if word not in ("--resume", "--overwrite")]
     return f"gs2d {shlex.join([*words, '--resume'])}"
-
-
-def _interrupted(argv: Sequence[str], command: Common) -> int:
-    """Print how to continue an interrupted command."""
-    line = f"interrupted; resume with: {_resumed(argv)}" if isinstance(command, HowItRuns) else "interrupted"
-    print(printable(line), file=sys.stderr)
-    return INTERRUPTED

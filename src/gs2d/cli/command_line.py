@@ -25,50 +25,23 @@ _MANY = 24  # columns; longer lists of choices are in the text of the option
 
 @dataclass(frozen=True)
 class Option:
-    """An option, a setting or a positional argument of a command.
+    """An option, a setting or a positional argument of a command."""
 
-    Attributes
-    ----------
-    field : str
-        Name of the dataclass field.
-    flags : tuple of str
-        Names on the command line, ``--out``; empty for a setting and a positional argument.
-    kind : type
-        bool for a switch, else the type of each value.
-    choices : tuple of str
-        The valid values; empty: any.
-    count : int or None
-        Number of values; None: one or more.
-    metavar : str
-        Word for a value in help.
-    default : object
-        ``dataclasses.MISSING`` if a value is required.
-    about : str
-        Docstring of the field, in one line.
-    owner : type
-        The dataclass that defines the field.
-    """
-
-    field: str
-    flags: tuple[str, ...]
+    field: str  # name of the dataclass field
+    flags: tuple[str, ...]  # names on the command line, `--out`; empty for a setting and a positional argument
     mark: Arg
-    kind: type
-    choices: tuple[str, ...]
-    count: int | None
-    metavar: str
-    default: Any
-    about: str
-    owner: type
+    kind: type  # bool for a switch, else the type of each value
+    choices: tuple[str, ...]  # the valid values; empty: any
+    count: int | None  # number of values; None: one or more
+    metavar: str  # word for a value in help
+    default: Any  # `dataclasses.MISSING` if a value is required
+    about: str  # docstring of the field, in one line
+    owner: type  # the dataclass that defines the field
 
     @property
     def required(self) -> bool:
         """Return whether the command needs a value."""
         return self.default is dataclasses.MISSING
-
-    @property
-    def positional(self) -> bool:
-        """Return whether the value is written without a name."""
-        return self.mark.positional
 
     @property
     def name(self) -> str:
@@ -83,7 +56,7 @@ class Option:
         if self.mark.setting:
             return f"{self.name}={value}"
         value = "" if self.kind is bool else value
-        return " ".join(word for word in ("" if self.positional else self.name, value) if word)
+        return " ".join(word for word in ("" if self.mark.positional else self.name, value) if word)
 
     def add_to(self, parser: argparse._ActionsContainer, text: str = "") -> None:
         """Add the option to a parser with its help text; no option is required there. Settings are for help only."""
@@ -96,7 +69,7 @@ class Option:
             parser.add_argument(*self.flags, dest=self.field, action=action, help=text)
             return
         nargs: int | str | None = "+" if self.count is None else self.count if self.count > 1 else None
-        if self.positional:
+        if self.mark.positional:
             nargs = "*" if self.count is None else "?"
         parser.add_argument(
             *(self.flags or (self.field,)),

@@ -102,11 +102,6 @@ def _screen(file: IO[str], **settings: Any) -> _Screen:
     return _Screen(file=file, highlight=False, color_system=color, **settings)  # type: ignore[arg-type]
 
 
-def _has_cursor(file: IO[str] | None) -> bool:
-    """Return whether lines can be overwritten: on a terminal with cursor movement."""
-    return file is not None and file.isatty() and os.environ.get("TERM", "") not in _NO_SCREENS
-
-
 class Console:
     """Prints events and results. ``quiet``: only JSON results; ``as_json``: only JSON on stdout.
 
@@ -122,7 +117,8 @@ class Console:
         self._before_each = before_each  # event; may raise
         self._out = _screen(sys.stdout, soft_wrap=True)
         self._err = _screen(sys.stderr)
-        self._interactive = _has_cursor(sys.stderr)
+        # Whether lines can be overwritten: on a terminal with cursor movement.
+        self._interactive = sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM") not in _NO_SCREENS
         self._live: Live | None = None
         self._bar: Bar | None = None
         self._named: set[str] = set()  # phases with a line in the log file
@@ -142,18 +138,13 @@ class Console:
             self._step(event)
         elif isinstance(event, Notice):
             if self._verbose or not event.detail:
-                self._note(event)
+                label, style = ("warning", "bold red") if event.is_warning else ("note", "yellow")
+                self._err.print(f"[{style}]{label}[/{style}] {escape(printable(event.text))}", soft_wrap=True)
         elif isinstance(event, NotMade):
-            self._err.print(
-                f"[red]not made[/red] {escape(printable(event.what))}: {escape(printable(event.reason))}",
-                soft_wrap=True,
-            )
+            line = f"[red]not made[/red] {escape(printable(event.what))}: {escape(printable(event.reason))}"
+            self._err.print(line, soft_wrap=True)
         elif isinstance(event, StageScored):
             self._err.print(event.line(), markup=False, soft_wrap=True)
-
-    def _note(self, notice: Notice) -> None:
-        label, style = ("warning", "bold red") if notice.is_warning else ("note", "yellow")
-        self._err.print(f"[{style}]{label}[/{style}] {escape(printable(notice.text))}", soft_wrap=True)
 
     def _begin(self, phase: Phase) -> None:
         self._bar = Bar(phase)

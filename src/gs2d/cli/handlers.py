@@ -13,6 +13,7 @@ from gs2d.cli import commands as c
 from gs2d.cli.console import Console, figure
 from gs2d.core.processes import process_rank
 from gs2d.errors import DataError, ProtocolError, RunError
+from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
 from gs2d.pipeline.prepare.options import EditOptions, MeshOptions, TextureOptions, values
 
 WIDTH = 60  # columns of the verdict: half of a small screen
@@ -22,21 +23,16 @@ EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows wi
 
 
 # -- tables and lines --------------------------------------------------------------------------------------------------
-def show_run(
-    path: Path,
-    metrics: dict[str, Any],
-    console: Console,
-    definition: dict[str, Any] | None = None,
-    extra: dict[str, Any] | None = None,
-) -> None:
+def show_run(run: RunFolder, console: Console, *, definition: bool = False, **extra: Any) -> None:
     """Show the metrics of a run as a table, its files, and its verdict; all of it with ``extra`` as JSON."""
     from gs2d.report.sections.verdict_section import read_verdict
 
-    result = {"run": str(path), **metrics, **(extra or {})}
-    if definition is not None:
-        recipe, scene = definition["recipe"]["name"], definition["scene"]
+    path, metrics = run.path, run.metrics()
+    result = {"run": str(path), **metrics, **extra}
+    if definition:
+        result["definition"] = whole = run.definition()
+        recipe, scene = whole["recipe"]["name"], whole["scene"]
         console.say(f"{recipe} on {scene['name']} ({scene['format']}, {scene['train']} + {scene['test']} views)")
-        result["definition"] = definition
     columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
     console.table("", columns, [_stage_row(stage) for stage in metrics["stages"]])
     show_surface(metrics.get("surface"), console)
@@ -67,18 +63,18 @@ def _stage_row(stage: dict[str, Any]) -> list[str]:
     ]
 
 
-def verdict_lines(verdict: Mapping[str, Any], width: int = WIDTH) -> list[str]:
-    """Return a verdict (that of ``verdict.json``) in lines of at most ``width`` columns."""
+def verdict_lines(verdict: Mapping[str, Any]) -> list[str]:
+    """Return a verdict (that of ``verdict.json``) in lines of at most ``WIDTH`` columns."""
     grade = verdict["grade"]
-    lines = textwrap.wrap(f"Verdict: {str(grade or 'none').upper()}. {verdict['headline']}", width)
+    lines = textwrap.wrap(f"Verdict: {str(grade or 'none').upper()}. {verdict['headline']}", WIDTH)
     for finding in verdict["findings"]:
         start = f"  {finding['grade'] or '-':<{_GRADES - 1}} {finding['name']:<{_NAMES - 1}} "
-        lines += textwrap.wrap(finding["figure"], width, initial_indent=start, subsequent_indent=" " * len(start))
+        lines += textwrap.wrap(finding["figure"], WIDTH, initial_indent=start, subsequent_indent=" " * len(start))
     advice = [finding["advice"] for finding in verdict["findings"] if finding["advice"]]
     if advice:
         lines.append("What to do next:")
     for text in advice:
-        lines += textwrap.wrap(text, width, initial_indent="- ", subsequent_indent="  ")
+        lines += textwrap.wrap(text, WIDTH, initial_indent="- ", subsequent_indent="  ")
     return lines
 
 
@@ -106,29 +102,23 @@ def show_surface(surface: dict[str, Any] | None, console: Console) -> None:
 
 
 # -- actions -----------------------------------------------------------------------------------------------------------
-def _keep_to(gib: float | None) -> None:
-    """Limit the memory of a command; training does so itself."""
-    from gs2d.pipeline.prepare.limits import use_memory
-
-    use_memory(gib)
-
-
 def train(command: c.TrainCommand, console: Console) -> None:
     """``gs2d train``."""
     from gs2d.pipeline.train.train_run import train as run_training
 
     run = run_training(command, console.on_event)
     if process_rank().leads:  # one process of several prints
-        show_run(run.path, run.metrics(), console)
+        show_run(run, console)
 
 
 def mesh(command: c.MeshCommand, console: Console) -> None:
     """``gs2d mesh``."""
     from gs2d.pipeline.finish.run_mesh import mesh_run
+    from gs2d.pipeline.prepare.limits import use_memory
 
     if command.run is not None and (command.splats, command.cameras) != (None, None):
         raise RunError("--splats and --cameras mesh a file instead of a run, got both; leave one of them out")
-    _keep_to(command.memory)
+    use_memory(command.memory)
     options = MeshOptions(**values(MeshOptions, command))
     if command.run is not None and command.texture:
         _textured_mesh(command.run, command, options, console)
@@ -168,8 +158,9 @@ def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console
 def render(command: c.RenderCommand, console: Console) -> None:
     """``gs2d render``."""
     from gs2d.pipeline.finish.run_images import render_run
+    from gs2d.pipeline.prepare.limits import use_memory
 
-    _keep_to(command.memory)
+    use_memory(command.memory)
     result = render_run(command.run, command, console.on_event, out=command.out, threads=command.threads)
     console.say(f"{result['images']} images in {result['folder']}")
     if "video" in result:
@@ -194,8 +185,9 @@ def view(command: c.ViewCommand, console: Console) -> None:
 def evaluate(command: c.EvaluateCommand, console: Console) -> None:
     """``gs2d evaluate``."""
     from gs2d.pipeline.finish.evaluate import evaluate_run
+    from gs2d.pipeline.prepare.limits import use_memory
 
-    _keep_to(command.memory)
+    use_memory(command.memory)
     result = evaluate_run(command.run, command, console.on_event, threads=command.threads)
     rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]
     if "exposure" in command.matched:
@@ -214,10 +206,14 @@ def evaluate(command: c.EvaluateCommand, console: Console) -> None:
 def export(command: c.ExportCommand, console: Console) -> None:
     """``gs2d export``."""
     from gs2d.pipeline.finish.splat_files import export_run
-    from gs2d.pipeline.look.page import SUFFIXES
+    from gs2d.pipeline.look.page import SUFFIXES, page_run
 
     if command.format == "html" or (command.out is not None and command.out.suffix.lower() in SUFFIXES):
-        _export_page(command, console)
+        if command.format not in (None, "html"):
+            raise RunError("an .html page takes no other --format; leave it out")
+        page = page_run(command.run, command.out, on_event=console.on_event)
+        console.say(f"{page['file']}: {page['splats']:,} splats, {page['bytes'] / 1e6:.1f} MB; open it in a browser")
+        console.result(page)
         return
     if command.out is None:
         raise RunError("gs2d export needs --out FILE, whose ending selects the format")
@@ -227,16 +223,6 @@ def export(command: c.ExportCommand, console: Console) -> None:
     )
     for note in result["notes"]:
         console.say(note)
-    console.result(result)
-
-
-def _export_page(command: c.ExportCommand, console: Console) -> None:
-    from gs2d.pipeline.look.page import page_run
-
-    if command.format not in (None, "html"):
-        raise RunError("an .html page takes no other --format; leave it out")
-    result = page_run(command.run, command.out, on_event=console.on_event)
-    console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
     console.result(result)
 
 
@@ -274,13 +260,12 @@ def recipes(command: c.RecipesCommand, console: Console) -> None:
 def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
     """``gs2d reconstruct``: then the figures, the files and the next command."""
     from gs2d.core.json_files import read_json
-    from gs2d.io.run_dir import PAGE
     from gs2d.pipeline.reconstruct import CAPTURE
     from gs2d.pipeline.reconstruct import reconstruct as run_all
     from gs2d.sfm.workspace import POSES_JSON
 
     run = run_all(command, console.on_event)
-    show_run(run.path, run.metrics(), console, extra={"poses": read_json(run.path / CAPTURE / POSES_JSON)})
+    show_run(run, console, poses=read_json(run.path / CAPTURE / POSES_JSON))
     console.say(f"look at it: open {PAGE} in a browser, or gs2d view {shlex.quote(str(run.path))}")
 
 
@@ -306,13 +291,11 @@ def poses(command: c.PosesCommand, console: Console) -> None:
 
 def info(command: c.InfoCommand, console: Console) -> None:
     """``gs2d info``."""
-    from gs2d.io.run_dir import is_run, open_run
     from gs2d.pipeline.look.info import describe_capture, describe_file
 
     path: Path = command.path
     if is_run(path):
-        run = open_run(path)
-        show_run(path, run.metrics(), console, definition=run.definition())
+        show_run(open_run(path), console, definition=True)
         return
     facts = describe_capture(path) if path.is_dir() else describe_file(path)
     for name, value in facts.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections.abc import Sequence
+from functools import partial
 
 from gs2d.cli.command_line import NAMES, Option, about, options_of
 from gs2d.cli.commands import COMMANDS, GROUPS, Common
@@ -46,7 +47,7 @@ def program_help(*, everything: bool = False) -> list[str]:
 def command_help(name: str, *, everything: bool = False) -> list[str]:
     """Return the help of a command: its most used options and the number of the others, or all options in groups."""
     options = options_of(NAMES[name])
-    needed = sorted((o for o in options if o.required or o.positional), key=lambda o: not o.positional)
+    needed = sorted((o for o in options if o.required or o.mark.positional), key=lambda o: not o.mark.positional)
     words = [o.usage if o.required else f"[{o.usage}]" for o in needed]
     titled = _groups(name, options)
     more = sum(len(group) for title, group in titled.items() if title)
@@ -62,10 +63,7 @@ def command_help(name: str, *, everything: bool = False) -> list[str]:
 
 def _parser(prog: str, usage: str, description: str, epilog: str) -> argparse.ArgumentParser:
     width = max(20, min(shutil.get_terminal_size().columns, WIDEST))
-
-    def formatter(prog: str) -> argparse.HelpFormatter:
-        return argparse.HelpFormatter(prog, max_help_position=28, width=width)
-
+    formatter = partial(argparse.HelpFormatter, max_help_position=28, width=width)
     return argparse.ArgumentParser(
         prog, usage, description, epilog, formatter_class=formatter, add_help=False, allow_abbrev=False
     )
@@ -74,7 +72,7 @@ def _parser(prog: str, usage: str, description: str, epilog: str) -> argparse.Ar
 def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
     """Return all options by heading: the most used under "", then those of the command, then shared options."""
     by_field = {option.field: option for option in options}
-    own = sorted((o for o in options if o.owner is not Common), key=lambda o: (not o.positional, not o.required))
+    own = sorted((o for o in options if o.owner is not Common), key=lambda o: (not o.mark.positional, not o.required))
     first = [by_field[field] for field in COMMANDS[name].first] or own
     groups: dict[str, list[Option]] = {title: [] for title in ("", _OWN, *TITLES.values())}
     groups[""] = first

@@ -74,10 +74,10 @@ def _field_values(name: str, words: Sequence[str]) -> dict[str, Any]:
     options = options_of(NAMES[name])
     trains = any(option.field == _OVERRIDES for option in options)  # then --set also changes the recipe
     parsed, rest = _Parser(options, trains).parse_known_intermixed_args(_normalised(words, options))
-    if unknown := next((word for word in rest if _is_flag(word)), None):
+    if unknown := next((w for w in rest if w.startswith("-") and len(w) > 1 and not _NUMBER.match(w)), None):
         raise UsageError(_no_option(name, unknown.partition("=")[0], options))
     if rest:
-        arguments = " ".join(option.usage for option in options if option.positional)
+        arguments = " ".join(option.usage for option in options if option.mark.positional)
         takes = f"{arguments} and options; a path with spaces needs quotes" if arguments else "options only"
         raise UsageError(f"unexpected {rest[0]!r}: the command takes {takes}")
     values = {field: value for field, value in vars(parsed).items() if value not in (None, [])}
@@ -120,14 +120,11 @@ def _normalised(words: Sequence[str], options: Sequence[Option]) -> list[str]:
     return normalised
 
 
-def _is_flag(word: str) -> bool:
-    return word.startswith("-") and len(word) > 1 and not _NUMBER.match(word)
-
-
 # -- paths -------------------------------------------------------------------------------------------------------------
 def check_inputs(command: Common) -> None:
     """Raise for an input path that does not exist; cheap, so that a misspelt path is reported at once."""
-    for option in options_of(type(command)):
+    kind: type = type(command)
+    for option in options_of(kind):
         path = getattr(command, option.field)
         if not isinstance(path, Path) or option.field in _OUTPUTS:
             continue

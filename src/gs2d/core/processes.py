@@ -1,4 +1,4 @@
-"""Rank of this process in a distributed training, from the environment of ``torchrun``. Does not import torch."""
+"""Cores of this process, and its rank in a distributed training (the environment of ``torchrun``). No torch."""
 
 from __future__ import annotations
 
@@ -34,6 +34,11 @@ class ProcessRank:
     def leads(self) -> bool:
         """Whether this is rank 0."""
         return self.rank == 0
+
+
+def available_cores() -> int:
+    """Return the CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def process_rank(environment: Mapping[str, str] = os.environ) -> ProcessRank:

@@ -43,6 +43,7 @@ from gs2d.core.growth import check_entries
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.locks import try_lock
 from gs2d.core.missing import path_hint, suggestion
+from gs2d.core.processes import available_cores
 from gs2d.core.text import first_line
 from gs2d.errors import DataError, RunError
 from gs2d.io.event_log import EventLog
@@ -374,8 +375,7 @@ def machine() -> dict[str, Any]:
             if line.startswith("model name"):
                 model = line.partition(":")[2].strip()
                 break
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"system": f"{platform.system()} {platform.release()}", "processor": model, "cores": cores}
+    return {"system": f"{platform.system()} {platform.release()}", "processor": model, "cores": available_cores()}
 
 
 def now() -> str:

@@ -24,16 +24,10 @@ REMADE_BY = {  # files of a finished run, and the command that makes them again
 
 @contextmanager
 def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[None]:
-    """Send a :class:`~gs2d.training.events.NotMade` event if the body fails, and continue.
+    """Send a :class:`~gs2d.training.events.NotMade` event if the body fails to make a file or section, and continue.
 
-    A full disk and a closed output pipe end the run all the same.
-
-    Parameters
-    ----------
-    what : str
-        The file or section that is made.
-    command : str or None
-        Makes it later (:func:`again`); None: the same command with ``--resume``; "": nothing does.
+    A full disk and a closed output pipe end the run all the same. ``command`` makes it later (:func:`again`); None: the
+    same command with ``--resume``; "": nothing does.
     """
     try:
         yield

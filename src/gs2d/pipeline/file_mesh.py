@@ -40,18 +40,11 @@ def mesh_file(
     cameras: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Mesh the splats of a file of any format; return the mesh file, counts and limits.
+    """Mesh the splats of a file of any format; return the mesh file ``out``, counts and limits.
 
-    Raises RunError or DataError or ProtocolError if a file, the capture or an option is invalid.
-
-    Parameters
-    ----------
-    splats_file : Path
-        3D Gaussians become disks across their shortest axes.
-    out : Path
-        Mesh file.
-    cameras : Path or None
-        Capture in the frame of the splats; its training views are rendered. None: ``choose_viewpoints``.
+    3D Gaussians become disks across their shortest axes. ``cameras`` is a capture in the frame of the splats, whose
+    training views are rendered; None: ``choose_viewpoints``. Raises RunError, DataError or ProtocolError if a file, the
+    capture or an option is invalid.
     """
     if out is None:
         raise RunError("--splats needs --out FILE, the mesh to write")

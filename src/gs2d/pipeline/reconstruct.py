@@ -14,11 +14,10 @@ from gs2d.core.missing import suggestion
 from gs2d.data import detect_format
 from gs2d.data.masks import OFF
 from gs2d.errors import DataError, ProtocolError, RunError
-from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, remove_made
+from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, make_folder
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import attempted_file
-from gs2d.pipeline.finish.run_texture import PACKAGES as TEXTURE_PACKAGES
-from gs2d.pipeline.finish.run_texture import texture_run
+from gs2d.pipeline.finish.run_texture import PACKAGE, texture_run
 from gs2d.pipeline.prepare.options import (
     Effort,
     HowItRuns,
@@ -39,7 +38,7 @@ from gs2d.pipeline.prepare.pose_finding import (
 )
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import difference
-from gs2d.pipeline.train.train_run import check_viewer, train
+from gs2d.pipeline.train.train_run import check_places, train
 from gs2d.sfm.colmap_process import check_installed
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.video_frames import is_video, look_into
@@ -78,12 +77,6 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
     training fails: ``resume`` then does not estimate the cameras again.
     """
     check_reconstruct(options)
-    find_cameras(options, on_event)
-    return train_found(options, on_event)
-
-
-def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
-    """Write the capture into the run folder, or take the one that ``resume`` finds there."""
     capture = options.out / CAPTURE
     if options.resume and (capture / POSES_JSON).exists():
         poses = _same_poses(capture, options)
@@ -96,10 +89,6 @@ def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
                 RunFolder(options.out).clear()
         for line in (f"{placed_line(poses)}; {capture / POSES_PNG} shows them", *lost_lines(poses)):
             on_event(Notice(line))
-
-
-def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
-    """Train on the capture in the run folder; texture the mesh if requested."""
     training, photos = replace(train_options(options), overwrite=False), options.photos.resolve()
     run = train(training, on_event, title=photos.stem if is_video(photos) else photos.name, allowed=_allowed(options))
     if options.texture and not run.file(TEXTURED).exists():
@@ -120,13 +109,9 @@ def check_reconstruct(options: ReconstructOptions) -> None:
     """Raise for anything that prevents the reconstruction, before anything is written."""
     training, out = train_options(options), options.out
     check_options(training)
-    check_claim(out, resume=options.resume, overwrite=options.overwrite, allowed=_allowed(options))
+    check_places(training, _allowed(options))
     if options.texture:
-        for package in TEXTURE_PACKAGES:
-            required(package)
-    check_viewer(training)
-    if training.cache is not None:
-        remove_made(make_folder(training.cache))
+        required(PACKAGE)
     if options.resume and (out / CAPTURE / POSES_JSON).exists():
         _same_poses(out / CAPTURE, options)
         return

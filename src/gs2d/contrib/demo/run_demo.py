@@ -7,13 +7,13 @@ from pathlib import Path
 from gs2d.contrib.demo.demo_capture import write_demo_capture
 from gs2d.contrib.demo.demo_command import DemoOptions
 from gs2d.errors import RunError
-from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
+from gs2d.io.run_dir import RunFolder, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.options import EvaluateOptions, HowItRuns, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.train.train_run import check_viewer, train
+from gs2d.pipeline.train.train_run import check_places, train
 from gs2d.training.events import OnEvent, Phase, Step, ignore
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
@@ -38,8 +38,7 @@ def demo(
         overwrite = True
     training = _train_options(options, overwrite=overwrite)
     check_options(training)  # before the photographs are rendered, which takes a while
-    check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=(CAPTURE,))
-    check_viewer(training)
+    check_places(training, (CAPTURE,))
     use_threads(options.threads)
     if not (options.resume and (capture / "transforms_train.json").exists()):
         _check_capture(capture)

@@ -11,4 +11,4 @@ from gs2d.contrib.demo.run_demo import demo
 def show_demo(command: DemoCommand, console: Console) -> None:
     """Run the demo and print its results."""
     run = demo(command, console.on_event)
-    show_run(run.path, run.metrics(), console)
+    show_run(run, console)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from gs2d.contrib.lab.task_order import Executor, given_up, several_at_once
 from gs2d.contrib.lab.tasks import AnyTask, Task, do
+from gs2d.core.processes import available_cores
 from gs2d.errors import BackendError
 from gs2d.io.run_dir import RunFolder, make_folder
 from gs2d.training.events import Notice, OnEvent, ignore
@@ -109,11 +110,6 @@ def execute(
                 do(task, on_event)
             failed |= {task.name} if task.outcome()["state"] == "failed" else set()
             after_task(task)
-
-
-def available_cores() -> int:
-    """Return the CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def gpu_count(backend: str) -> int:

@@ -21,7 +21,7 @@ from gs2d.errors import RunError
 from gs2d.io.run_dir import SPLATS, RunFolder, is_run, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.finish.run_images import choose_views, draw_stage
+from gs2d.pipeline.finish.run_images import draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import peak_memory, score_views, split_metrics
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance, write_appearance
@@ -143,9 +143,8 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
         drawing, seen_by = (loaded.settings, loaded.backend), [collected.visit]
         scores = score_views(splats, views, *drawing, on_event, split=split, visitors=seen_by)
         entry |= split_metrics(scores, split)
-    shown = choose_views(seen)
     with attempted(f"images of {STAGE}", None, on_event):
-        draw_stage(run, loaded, shown, STAGE, splats, None)
+        draw_stage(run, loaded, seen, STAGE, splats, None)
     release(scene)
     entry["peak_memory_bytes"] = max(entry["peak_memory_bytes"], peak_memory())
     run.write_metrics({"stages": [entry], "surface": None})

@@ -17,7 +17,7 @@ from gs2d.errors import RunError
 def show_blocks(command: BlocksCommand, console: Console) -> None:
     """Run ``gs2d blocks``."""
     run = blocks(command, console.on_event)
-    show_run(run.path, run.metrics(), console)
+    show_run(run, console)
 
 
 def show_table(command: SweepCommand, console: Console) -> None:

@@ -26,7 +26,6 @@ from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RENDERS, RunFolder, make_folder, remove_made
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.finish.scoring import evenly
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.finish.viewpoints import orbit_cameras
 from gs2d.pipeline.prepare.learned_views import photographed
@@ -35,14 +34,7 @@ from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.report.color_maps import (
-    depth_image,
-    depth_limits,
-    error_image,
-    highlight_image,
-    normal_image,
-    valid_image,
-)
+from gs2d.report.color_maps import depth_image, depth_limits, error_image, highlight_image, normal_image, valid_image
 from gs2d.report.gallery import Gallery, read_gallery
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
@@ -56,12 +48,6 @@ FPS = 30.0  # of a video
 
 
 # -- images of the report ----------------------------------------------------------------------------------------------
-def choose_views(scene: Scene, count: int = SHOWN_VIEWS) -> list[tuple[str, View]]:
-    """Return (split, view) of the views to show: evenly spaced test views, or training views without any."""
-    split, views = ("test", scene.test) if scene.test else ("train", scene.train)
-    return [(split, view) for view in evenly(views, count)]
-
-
 def file_names(views: Sequence[View]) -> list[str]:
     """Return a file name without suffix for each view; names that are too long or equal get a hash."""
     names = []
@@ -82,41 +68,38 @@ def _short_hash(text: str) -> str:
 
 
 def draw_stage(
-    run: RunFolder,
-    loaded: LoadedRun,
-    shown: Sequence[tuple[str, View]],
-    stage: str,
-    splats: Splats,
-    group: Tensor | None,
+    run: RunFolder, loaded: LoadedRun, scene: Scene, stage: str, splats: Splats, group: Tensor | None
 ) -> None:
-    """Write the images of one stage, the photographs, and the index of both.
+    """Write the images of one stage, the photographs, and the index of both, of a few test views (or training views).
 
-    Views are drawn with the appearance of their photographs, if known.
-
-    Parameters
-    ----------
-    group : Tensor [N] bool or None
-        The high-error splats, once they are known.
+    They are drawn with the appearance of their photographs, as far as ``scene`` knows it. ``group`` [N] bool are the
+    high-error splats, once they are known.
     """
+    split, every = ("test", scene.test) if scene.test else ("train", scene.train)
+    count = min(SHOWN_VIEWS, len(every))
+    shown = [every[(2 * i + 1) * len(every) // (2 * count)] for i in range(count)]  # evenly spaced
     folder = run.file(RENDERS)
     for name in ("photos", stage):
         make_folder(folder / name)
     drawn = read_gallery(folder) or Gallery(folder, (), ())
     limits = {view.name: view.depth_limits for view in drawn.views}
     views, background = [], loaded.settings.background
-    files = file_names([view for _, view in shown])
-    for (split, view), file in zip(shown, files, strict=True):
+    for view, file in zip(shown, file_names(shown), strict=True):
         output = render_view(splats, view, loaded.settings, loaded.backend)
         depth = output.depth(loaded.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
         # All stages use the limits of the first, so that they can be compared.
-        near_far = limits.get(view.name) or shown_limits(loaded.scene, view, depth, alpha)
+        near_far = limits.get(view.name)
+        if near_far is None:  # from depths within reach, if there are any
+            reach = believed_reach(loaded.scene)
+            near = alpha if reach is None else alpha * within_reach(reach, view.camera, depth)
+            near_far = depth_limits(depth, near if (near >= 0.5).any() else alpha)
         photo = view.target(background)
         color = photographed(view, output.color, background).cpu().numpy()
         images = {
             "color": np.clip(color, 0, 1),
             "normal": normal_image(output.normal.cpu().numpy(), alpha),
-            "depth": depth_image(depth, alpha, (near_far[0], near_far[1])),
+            "depth": depth_image(depth, alpha, near_far),
             "error": error_image(color, photo, view.mask()),
         }
         if group is not None:
@@ -129,13 +112,6 @@ def draw_stage(
         views.append({**shown_as, "camera": camera_json(view.camera)})
     stages = [*(name for name in drawn.stages if name != stage), stage]
     write_json(folder / INDEX, {"views": views, "stages": stages, "images": list(IMAGES)})
-
-
-def shown_limits(scene: Scene, view: View, depth: np.ndarray, alpha: np.ndarray) -> list[float]:
-    """Return the limits of the depth colours, world units, from depths within reach if there are any."""
-    reach = believed_reach(scene)
-    near = alpha if reach is None else alpha * within_reach(reach, view.camera, depth)
-    return list(depth_limits(depth, near if (near >= 0.5).any() else alpha))
 
 
 def camera_json(camera: Camera) -> dict[str, Any]:

@@ -41,6 +41,7 @@ from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_re
 from gs2d.pipeline.prepare.limits import release, release_buffers
 from gs2d.pipeline.prepare.loaded import RenderedScene, checked_output, open_finished
 from gs2d.pipeline.prepare.options import MeshOptions
+from gs2d.pipeline.prepare.predicted_exposure import LUMA
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
@@ -57,7 +58,6 @@ LEAST_SLAB_BYTES = 32 << 20  # smaller slabs spend most of the time on preparing
 MOSTLY_CUT = 0.5  # fraction of the depth outside the mesh from which a notice is sent
 COARSER_ERROR = 4.0  # times that of the level of detail before: about a quarter of its faces
 COARSER = 3  # attempts with larger voxels: the first size is an estimate
-GREY = (0.299, 0.587, 0.114)  # ITU-R BT.601
 LEAST_VIEWS = 2
 
 
@@ -73,10 +73,7 @@ def extract_mesh(
 ) -> dict[str, Any]:
     """Fuse rendered depth of the training views, write the mesh, and return its file, counts and limits.
 
-    Parameters
-    ----------
-    subject : Subject or None
-        Mesh the subject only.
+    With ``subject``, only the subject is meshed.
     """
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
@@ -113,12 +110,7 @@ def extract_mesh(
 
 
 def fused(
-    loaded: RenderedScene,
-    splats: Splats,
-    options: MeshOptions,
-    on_event: OnEvent,
-    *,
-    subject: Subject | None = None,
+    loaded: RenderedScene, splats: Splats, options: MeshOptions, on_event: OnEvent, *, subject: Subject | None = None
 ) -> Extraction:
     """Fuse rendered depth of the training views; arguments as of :func:`extract_mesh`.
 
@@ -305,7 +297,7 @@ def refined(
     def read(index: int, factor: int) -> GreyImage:
         view = views[index]
         small = ColorSource(view.camera, view.image(), usable_pixels(view, loaded)).shrunk(factor)
-        grey = small.image[..., :3] @ np.asarray(GREY, np.float32) / np.float32(255)
+        grey = small.image[..., :3] @ np.asarray(LUMA, np.float32) / np.float32(255)
         return GreyImage(small.camera, np.ascontiguousarray(grey, np.float32), small.valid)
 
     refinement = Refinement(mesh, [view.camera for view in views], read, settings, ready_library())

@@ -31,6 +31,7 @@ from gs2d.io.run_dir import SUBJECT, RunFolder
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.mesh_methods import MESH_METHODS
 from gs2d.pipeline.finish.trusted_depth import surface_reach
+from gs2d.pipeline.look.page import some_views
 from gs2d.pipeline.prepare.loaded import RenderedScene
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
@@ -45,30 +46,11 @@ ENOUGH_POINTS = 20
 MAX_POINTS = 2000  # sparse points per camera
 
 
-def subject_of(
-    run: RunFolder, loaded: RenderedScene, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
-) -> Subject:
-    """Return the subject of a run: ``box``, else that of ``subject.json``, else the one found; write it there.
-
-    Raises ProtocolError if the box is invalid, or the splats show no surface, RunError if there is no splat in the box,
-    DataError if ``subject.json`` is damaged.
-
-    Parameters
-    ----------
-    box : sequence of 6 floats, optional
-        x0 y0 z0 x1 y1 z1, world units.
-    """
-    known = read_subject(run.path) if box is None else None
-    if known is not None:
-        return known
-    subject = subject_in(loaded, splats, box)
-    on_event(Notice(subject_line(subject, meshed=box is not None or loaded.protocol.fusion.subject)))
-    write_json(run.file(SUBJECT), subject.to_json())
-    return subject
-
-
 def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | None = None) -> Subject:
-    """Return the subject of a scene without reading or writing files; errors are as in :func:`subject_of`."""
+    """Return the subject of a scene: ``box`` (x0 y0 z0 x1 y1 z1, world units), else the one that is found.
+
+    Raises ProtocolError if the box is invalid, or the splats show no surface, RunError if there is no splat in the box.
+    """
     if box is not None:
         centers_inside(splats, box, "--subject-box")
     try:
@@ -89,12 +71,8 @@ def meshed_subject(
 ) -> Subject | None:
     """Return the subject if it is meshed, None if everything or another box is meshed.
 
-    Parameters
-    ----------
-    run : RunFolder or None
-        Remembers its subject, which is found even if it is not meshed.
-    box : sequence of 6 floats, optional
-        Without a run: the subject, unless ``options`` have one.
+    A run remembers its subject in ``subject.json``, even if it is not meshed. Without a run, ``box`` (6 numbers) is the
+    subject unless ``options`` have one. Raises DataError if ``subject.json`` is damaged.
     """
     chosen = options.subject_box
     others = {
@@ -103,25 +81,22 @@ def meshed_subject(
     }
     check_subject_box(chosen, others)
     wanted = chosen is not None or (loaded.protocol.fusion.subject and not any(others.values()))
-    if run is not None:
-        subject = subject_of(run, loaded, splats, on_event, box=chosen)
-    elif wanted:
-        subject = subject_in(loaded, splats, chosen or box)
-        on_event(Notice(subject_line(subject, meshed=True)))
+    if run is None and not wanted:
+        return None
+    subject = read_subject(run.path) if run is not None and chosen is None else None
+    if subject is None:
+        subject = subject_in(loaded, splats, chosen or (box if run is None else None))
+        on_event(Notice(subject_line(subject, meshed=chosen is not None or loaded.protocol.fusion.subject)))
+        if run is not None:
+            write_json(run.file(SUBJECT), subject.to_json())
     return subject if wanted and subject.kind == OBJECT else None
 
 
 def centers_inside(splats: Splats, box: Sequence[float], option: str) -> Tensor:
     """Return which splats have their centres in a box, bool [N].
 
-    Raises DataError if the box is invalid, RunError if there is no splat in it.
-
-    Parameters
-    ----------
-    box : sequence of 6 floats
-        x0 y0 z0 x1 y1 z1, world units; the faces belong to it.
-    option : str
-        Name of the box in errors.
+    ``box`` is x0 y0 z0 x1 y1 z1, world units; its faces belong to it. ``option`` is its name in errors. Raises
+    DataError if the box is invalid, RunError if there is no splat in it.
     """
     low, high = torch.from_numpy(checked_box(box, option)).to(splats.means)
     inside = ((splats.means >= low) & (splats.means <= high)).all(dim=1)
@@ -147,14 +122,11 @@ def subject_line(subject: Subject, *, meshed: bool) -> str:
 
 def sights(loaded: RenderedScene, splats: Splats) -> list[Sight]:
     """Return the votes of some training cameras: rendered depth, and visible sparse points."""
-    views = loaded.scene.train
-    count = min(len(views), MAX_VIEWS)
-    chosen = [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
     points = np.zeros((0, 3)) if loaded.scene.points is None else np.asarray(loaded.scene.points.points, np.float64)
     reach = surface_reach(loaded)
     return [
         _sight(camera := _small(view.camera), _depth(loaded, splats, camera), points, _kept(loaded, view), reach)
-        for view in chosen
+        for view in some_views(loaded.scene.train, MAX_VIEWS)
     ]
 
 

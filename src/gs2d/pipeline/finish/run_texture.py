@@ -39,7 +39,7 @@ from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
-PACKAGES = ("xatlas",)  # of the extra `texture`
+PACKAGE = "xatlas"  # of the extra `texture`
 PASSES = ("colouring the texture", "comparing the colours")
 
 
@@ -58,8 +58,7 @@ def texture_run(
     replaces ``mesh.ply`` if ``out`` is None.
     """
     check_texture_options(options)
-    for package in PACKAGES:
-        required(package)  # before minutes are spent
+    required(PACKAGE)  # before minutes are spent
     path = Path(path)
     target = path / TEXTURED if out is None else Path(out)
     files = written_files(target)
@@ -125,7 +124,7 @@ def _mesh(run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOption
 def _views(loaded: LoadedRun, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
     """Return the training views at the requested size, with refined cameras and learned appearance."""
     scene = loaded.scene
-    if options.texture_downscale in (None, loaded.downscale) or scene.root is None:
+    if options.texture_downscale in (None, loaded.resolved.downscale) or scene.root is None:
         return scene.train
     downscale = options.texture_downscale or 1
     resized = read_scene(scene.root, scene.format, downscale, loaded.protocol, on_event, scene.masks)

@@ -50,60 +50,35 @@ SPREAD_DEPTH = 0.05  # of the mean depth; the depth that hides a sparse point (e
 # -- measures ----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class ViewMeasures:
-    """One view of the finished splats.
-
-    Attributes
-    ----------
-    psnr : float or None
-        dB, of 8-bit images.
-    points, hidden : int or None
-        Sparse points visible in a test view, and how many of them its rendering hides.
-    spread : float or None
-        Share of the opaque pixels of the subject whose surface is unclear (:class:`SurfaceSample`).
-    transparent : float or None
-        Share of the pixels in which the background shows through, of a training view without alpha channel.
-    """
+    """One view of the finished splats."""
 
     name: str
     split: str
-    psnr: float | None = None
-    points: int | None = None
-    hidden: int | None = None
-    spread: float | None = None
+    psnr: float | None = None  # dB, of 8-bit images
+    points: int | None = None  # sparse points visible in a test view
+    hidden: int | None = None  # how many of them its rendering hides
+    spread: float | None = None  # share of the opaque pixels of the subject whose surface is unclear (`SurfaceSample`)
+    # Share of the pixels in which the background shows through, of a training view without alpha channel.
     transparent: float | None = None
 
 
 @dataclass(frozen=True)
 class Measures:
-    """The input of a verdict.
-
-    Attributes
-    ----------
-    placed, count : int or None
-        Photographs with a camera and all photographs, if ``gs2d poses`` made the capture.
-    lost : tuple of str
-        Names of the photographs without a camera.
-    """
+    """The input of a verdict."""
 
     views: tuple[ViewMeasures, ...]
-    placed: int | None = None
-    count: int | None = None
-    lost: tuple[str, ...] = ()
+    placed: int | None = None  # photographs with a camera, if `gs2d poses` made the capture
+    count: int | None = None  # all photographs, in that case
+    lost: tuple[str, ...] = ()  # names of the photographs without a camera
 
 
 class Collector:
-    """Measures each view while it is scored; pass :meth:`visit` to ``scoring.score_views``.
-
-    Attributes
-    ----------
-    failure : Exception or None
-        The error that stopped the measuring; scoring continues.
-    """
+    """Measures each view while it is scored; pass :meth:`visit` to ``scoring.score_views``."""
 
     def __init__(self, scene: Scene) -> None:
         self._views: dict[str, ViewMeasures] = {}
         self._surfaces: dict[str, SurfaceSample] = {}
-        self.failure: Exception | None = None
+        self.failure: Exception | None = None  # stopped the measuring; scoring continues
         self._observed = scene.observed(guessed=False)  # None: floaters cannot be counted
 
     def views(self, box: np.ndarray | None = None) -> tuple[ViewMeasures, ...]:
@@ -150,21 +125,12 @@ class SurfaceSample:
 
     There the depths of half transmittance and of the mean differ by more than ``SPREAD_DEPTH``: part of the splats is
     not on the surface, as in a faint veil in front of it. The image can be right, but the mesh tears.
-
-    Attributes
-    ----------
-    center : ndarray [3] world units
-    rays : ndarray [n, 3] float32
-        From the camera centre, with a depth of 1.
-    depth : ndarray [n] world units
-        Of half transmittance.
-    unclear : ndarray [n] bool
     """
 
-    center: np.ndarray
-    rays: np.ndarray
-    depth: np.ndarray
-    unclear: np.ndarray
+    center: np.ndarray  # [3] world units
+    rays: np.ndarray  # [n, 3] float32; from the camera centre, with a depth of 1
+    depth: np.ndarray  # [n] world units; of half transmittance
+    unclear: np.ndarray  # [n] bool
 
     @classmethod
     def of(cls, camera: Camera, output: RenderOutput) -> SurfaceSample:

@@ -23,28 +23,14 @@ from gs2d.training.events import OnEvent, counted
 
 @dataclass(frozen=True, eq=False)
 class RenderedPhotograph:
-    """A rendered view with its photograph.
-
-    Attributes
-    ----------
-    split : str
-        "train", "test" or "".
-    output : RenderOutput
-        Without distortion, in the colours of the scene.
-    image : Tensor [H, W, 3]
-        Colour with the appearance of the photograph; may exceed 1.
-    target : Tensor [H, W, 3]
-        The photograph over the background, in [0, 1].
-    mask : Tensor [H, W] bool or None
-        False = ignore this pixel.
-    """
+    """A rendered view with its photograph."""
 
     view: View
-    split: str
-    output: RenderOutput
-    image: torch.Tensor
-    target: torch.Tensor
-    mask: torch.Tensor | None
+    split: str  # "train", "test" or ""
+    output: RenderOutput  # without distortion, in the colours of the scene
+    image: torch.Tensor  # [H, W, 3]; colour with the appearance of the photograph; may exceed 1
+    target: torch.Tensor  # [H, W, 3]; the photograph over the background, in [0, 1]
+    mask: torch.Tensor | None  # [H, W] bool; False = ignore this pixel
 
 
 Visitor = Callable[[RenderedPhotograph, ImageMetrics], None]
@@ -103,12 +89,6 @@ def split_metrics(scores: dict[str, ImageMetrics], name: str, split: str | None 
     if not scores:
         return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
     return {name: mean_metrics(list(scores.values())).to_json()}
-
-
-def evenly(views: Sequence[View], most: int) -> Sequence[View]:
-    """Return at most ``most`` views, evenly spaced."""
-    count = min(most, len(views))
-    return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
 def peak_memory() -> int:

@@ -34,10 +34,7 @@ from gs2d.pipeline.prepare.options import EditOptions, Transform
 def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, Any]:
     """Write the splats of a run, or of a file of flat splats, in another format.
 
-    Parameters
-    ----------
-    layout : str or None
-        A name in ``io.formats.splat_formats.LAYOUTS``; None: by the ending of ``out``.
+    ``layout`` is a name in ``io.formats.splat_formats.LAYOUTS``; None: by the ending of ``out``.
     """
     path, out = Path(path), Path(out)
     layout = checked_layout(path, out, layout)
@@ -80,20 +77,10 @@ def splats_of(path: Path, tell: Tell) -> Splats:
 def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str, Any]:
     """Edit the splats of a run, or write the edited splats of a run or a file to ``out``.
 
-    Raises RunError or DataError if the options contradict each other, the edit concerns no splat or leaves none, or a
-    file is damaged.
-
-    Parameters
-    ----------
-    path : Path
-        Run folder, or a file of flat splats, which needs ``out``.
-    out : Path or None
-        File to write, in the format of its ending; None: replace the splats of the run, undoably.
-
-    Returns
-    -------
-    dict
-        ``file``, ``splats`` and ``before`` (numbers of splats), ``notes``.
+    ``path`` is a run folder, or a file of flat splats, which needs ``out``, a file in the format of its ending. Without
+    ``out`` the splats of the run are replaced, undoably. Returns ``file``, ``splats`` and ``before`` (numbers of
+    splats), and ``notes``. Raises RunError or DataError if the options contradict each other, the edit concerns no
+    splat or leaves none, or a file is damaged.
     """
     path, out = Path(path), None if out is None else Path(out)
     _check(path, options, out)

@@ -49,12 +49,8 @@ def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | No
     """Return the cameras of a circle around the focus, with the median radius and height of the photographs.
 
     If a part of the circle was not photographed (``photographed_arc``), the path swings back and forth over the rest,
-    at the local distance and height of the photographs.
-
-    Parameters
-    ----------
-    focus : ndarray [3], optional
-        World units (default: the point nearest to the optical axes).
+    at the local distance and height of the photographs. ``focus`` [3] is in world units (default: the point
+    nearest to the optical axes).
     """
     focus = focus_point(cameras) if focus is None else np.asarray(focus, np.float64)
     up = up_direction(cameras)
@@ -85,10 +81,7 @@ def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | No
 def photographed_arc(angles: np.ndarray) -> tuple[float, float] | None:
     """Return start and width of the arc of the cameras, rad; None if they are all around.
 
-    Parameters
-    ----------
-    angles : ndarray [V]
-        Directions from the focus to the cameras, rad.
+    ``angles`` [V] are the directions from the focus to the cameras, rad.
     """
     ordered = np.sort(np.mod(angles, 2 * np.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
@@ -110,19 +103,11 @@ def _photographed_at(
 # -- viewpoints --------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Viewpoints:
-    """Cameras for splats.
-
-    Attributes
-    ----------
-    box : ndarray [2, 3] world units, or None
-        Corners of the box of the subject that they surround; None in a room.
-    why : str
-        Reason, in a few words.
-    """
+    """Cameras for splats."""
 
     cameras: tuple[Camera, ...]
-    box: ndarray | None
-    why: str
+    box: ndarray | None  # [2, 3] world units, of the subject that they surround; None in a room
+    why: str  # reason, in a few words
 
 
 def choose_viewpoints(splats: Splats, settings: RasterSettings, backend: Backend) -> Viewpoints:
@@ -141,7 +126,9 @@ def choose_viewpoints(splats: Splats, settings: RasterSettings, backend: Backend
     if not radius > 0:
         raise DataError(f"expected splats that are a surface, got {len(solid):,} in one point")
     near = np.flatnonzero(np.linalg.norm(means - center, axis=1) <= 1.1 * radius)
-    size = _image_size(len(near))
+    # In images of this size, splats that are evenly spread over the subject are SPLAT_PIXELS apart.
+    radii = math.sqrt(len(near) / (4 * math.pi))  # radius of the subject, in distances between splats
+    size = int(np.clip(round(SPLAT_PIXELS * radii * math.sqrt(1 + (2 * FOCAL) ** 2) / FOCAL), *SIZES))
     box = np.percentile(means[near], [TAIL, 100 - TAIL], axis=0)
     box += MARGIN * np.ptp(box, axis=0).max() * np.array([[-1], [1]])
     near = near[:: max(1, len(near) // POINTS)]
@@ -189,12 +176,6 @@ def _sphere(count: int) -> ndarray:
     z, turn = 1 - (2 * k + 1) / count, k * np.pi * (3 - math.sqrt(5))
     flat = np.sqrt(1 - z * z)
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
-
-
-def _image_size(splats: int) -> int:
-    """Return the size of images, px, in which splats that are evenly spread over the subject are SPLAT_PIXELS apart."""
-    radii = math.sqrt(splats / (4 * math.pi))  # radius of the subject, in distances between splats
-    return int(np.clip(round(SPLAT_PIXELS * radii * math.sqrt(1 + (2 * FOCAL) ** 2) / FOCAL), *SIZES))
 
 
 def _camera(eye: ndarray, target: ndarray, size: int, *, focal: float = FOCAL) -> Camera:

@@ -42,25 +42,11 @@ MARGIN = 0.1  # of the longest side of that box, added on each side
 
 
 def page_run(
-    path: Path,
-    out: Path | None = None,
-    *,
-    on_event: OnEvent = ignore,
-    loaded: LoadedRun | None = None,
+    path: Path, out: Path | None = None, *, on_event: OnEvent = ignore, loaded: LoadedRun | None = None
 ) -> dict[str, Any]:
-    """Write the page of a run or of a file of splats.
+    """Write the page of a run or of a file of splats; return ``file``, ``splats``, ``sh_degree``, ``views``, ``bytes``.
 
-    Parameters
-    ----------
-    out : Path or None
-        None: ``scene.html`` in the run, or next to the file.
-    loaded : LoadedRun or None
-        The run, if it is already loaded.
-
-    Returns
-    -------
-    dict
-        ``file``, ``splats``, ``sh_degree``, ``views``, ``bytes``.
+    ``out`` is ``scene.html`` in the run, or next to the file, by default. ``loaded`` is the run, if it is in memory.
     """
     path = Path(path)
     of_run = path.is_dir() or is_run(path)
@@ -109,20 +95,12 @@ def _embedded_meshes(run: RunFolder) -> dict[str, bytes]:
 
 @dataclass(frozen=True, eq=False)
 class PageContent:
-    """Content of a page.
-
-    Attributes
-    ----------
-    photographs : sequence of View
-        Those of ``scene.views``, in order; empty if the capture is missing.
-    run : RunFolder or None
-        None: the splats are of a file.
-    """
+    """Content of a page."""
 
     splats: Splats
     scene: PageScene
-    photographs: Sequence[View]
-    run: RunFolder | None
+    photographs: Sequence[View]  # those of `scene.views`, in order; empty if the capture is missing
+    run: RunFolder | None  # None: the splats are of a file
 
 
 def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | None = None) -> PageContent:
@@ -187,9 +165,9 @@ def _most_splats(centers: np.ndarray) -> Subject:
     return Subject(OBJECT, *box, (low + high) / 2, np.array([0.0, 0.0, 1.0]), "nearly all splats; there are no cameras")
 
 
-def some_views(views: Sequence[View]) -> list[View]:
-    """Return at most MAX_VIEWS of the views, evenly spaced."""
-    count = min(len(views), MAX_VIEWS)
+def some_views(views: Sequence[View], most: int = MAX_VIEWS) -> list[View]:
+    """Return at most so many of the views, evenly spaced, with the first and the last."""
+    count = min(len(views), most)
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
 
 

@@ -29,26 +29,22 @@ _TICK = 0.2  # s between checks for Ctrl-C
 def open_viewer(path: Path, port: int | None = None, on_event: OnEvent = ignore) -> tuple[PageServer, list[str]]:
     """Start a server of a run or a file of splats; the caller must ``close`` it.
 
-    Returns
-    -------
-    server : PageServer
-    shown : list of str
-        What the page shows: "cameras", "mesh", "splats".
+    Also returns what the page shows: "cameras", "mesh", "splats".
     """
     content = page_content(path, on_event)
     stages: dict[str, Callable[[], Splats]] = {FINAL: lambda: content.splats}
-    meshes: dict[str, Callable[[], bytes]] = {}
+    meshes: dict[str, Route] = {}
     if content.run is not None:
         ends = [checkpoint for checkpoint in content.run.checkpoints() if checkpoint.iteration is None]
         earlier = {end.stage: partial(_splats_of, end.path) for end in ends[:-1]}  # the last one is splats.ply
-        stages, meshes = {**earlier, **stages}, _meshes_of(content.run)
+        stages, meshes = {**earlier, **stages}, _mesh_routes(content.run)
     has_photographs = bool(content.photographs)
     page = served_page(content.scene, PageOffer(tuple(meshes), has_photographs, stages=tuple(stages)))
     routes: dict[str, Route] = {
         "": lambda _: Answer("text/html; charset=utf-8", [page]),
         "splats": _stages_route(stages, content.scene),
         "photograph": photographs_route(content.photographs, content.scene.settings.background),
-        **{name: partial(_mesh_answer, block) for name, block in meshes.items()},
+        **meshes,
     }
     shown = [*(["cameras"] if has_photographs else []), *(["mesh"] if meshes else []), "splats"]
     return PageServer(port, routes), shown
@@ -93,15 +89,12 @@ def _splats_of(checkpoint: Path) -> Splats:
     return TrainState.from_state_dict(load_tensors(checkpoint)["state"]).splats
 
 
-def _meshes_of(run: RunFolder) -> dict[str, Callable[[], bytes]]:
-    """Return functions that read the meshes of a run for the page."""
-    readers: dict[str, Callable[[], bytes]] = {
-        "mesh": lambda: web_mesh(read_mesh(run.file(MESH))),
-        "textured": lambda: web_mesh(read_textured(run.file(TEXTURED))),
-    }
+def _mesh_routes(run: RunFolder) -> dict[str, Route]:
+    """Return the routes of the meshes that a run has."""
+
+    def answer(name: str, _: Mapping[str, str]) -> Answer:
+        mesh = read_mesh(run.file(MESH)) if name == "mesh" else read_textured(run.file(TEXTURED))
+        return Answer("application/octet-stream", [web_mesh(mesh)])
+
     files = {"mesh": MESH, "textured": TEXTURED}
-    return {name: read for name, read in readers.items() if run.file(files[name]).exists()}
-
-
-def _mesh_answer(block: Callable[[], bytes], _: Mapping[str, str]) -> Answer:
-    return Answer("application/octet-stream", [block()])
+    return {name: partial(answer, name) for name, file in files.items() if run.file(file).exists()}

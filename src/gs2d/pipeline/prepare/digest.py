@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -32,7 +32,14 @@ def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -
         digest.update(name_bytes(f"{view.name} {'train' if id(view) in train else 'test'}"))
         mask = view.alpha() if scene.masks.masked == EMPTY else view.mask() if uses_masks else None
         empty += [view] if mask is not None and not mask.any() else []
-        for array in _of_photograph(view):
+        camera = view.camera
+        arrays = [
+            np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy], np.float64),
+            camera.T_cam_world,
+            view.image(),
+            *(mask for mask in (view.mask(), view.object_mask()) if mask is not None),
+        ]
+        for array in arrays:
             digest.update(f"{array.shape} {array.dtype}".encode())
             digest.update(np.ascontiguousarray(array).data)
     if empty:
@@ -46,16 +53,6 @@ def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -
             digest.update(np.ascontiguousarray(scene.points.colors).tobytes())
     digest.update(np.float64(scene.extent).tobytes() + np.ascontiguousarray(scene.bounds, np.float64).tobytes())
     return digest.hexdigest()
-
-
-def _of_photograph(view: View) -> Iterator[np.ndarray]:
-    camera = view.camera
-    yield np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
-    yield camera.T_cam_world
-    yield view.image()
-    for mask in (view.mask(), view.object_mask()):
-        if mask is not None:
-            yield mask
 
 
 def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) -> str:

@@ -55,24 +55,12 @@ class Range(NamedTuple):
 
 @dataclass(frozen=True)
 class Estimate:
-    """What training on a capture needs.
+    """What training on a capture needs."""
 
-    Attributes
-    ----------
-    start : int
-        Initial splats.
-    max_splats : int or None
-        Largest number of splats that fits into memory, where that limits them.
-    memory : Range
-        Bytes.
-    seconds : Range
-        Of the whole run.
-    """
-
-    start: int
-    max_splats: int | None
-    memory: Range
-    seconds: Range
+    start: int  # initial splats
+    max_splats: int | None  # the largest number that fits into memory, where that limits them
+    memory: Range  # bytes
+    seconds: Range  # of the whole run
 
     def line(self) -> str:
         """Return time and memory in one line."""
@@ -90,14 +78,8 @@ def estimate(
 ) -> Estimate:
     """Estimate the training of a scene.
 
-    Raises DataError if the initial splats do not fit into memory.
-
-    Parameters
-    ----------
-    downscale : int
-        Factor by which the photographs are smaller than their files.
-    start : int, optional
-        Initial number of splats, if known.
+    ``downscale`` is the factor by which the photographs are smaller than their files, ``start`` the initial number of
+    splats, if known. Raises DataError if the initial splats do not fit into memory.
     """
     allowed = memory_budget()
     start = initial_splats(scene, recipe) if start is None else start

@@ -117,13 +117,8 @@ def matched_by_halves(
     """Return a rendering with its colours matched to the photograph.
 
     Each half gets the transform that fits the other half best (least squares), so that no pixel is matched to itself.
-
-    Parameters
-    ----------
-    color, target : Tensor [H, W, 3]
-        Rendering and photograph, over the background.
-    mask : Tensor [H, W] bool or None
-        False = ignore this pixel.
+    ``color`` and ``target`` [H, W, 3] are rendering and photograph over the background; False in ``mask`` [H, W]:
+    ignore this pixel.
     """
     camera = replace(view, appearance={k: found for k, found in view.appearance.items() if k != "exposure"})
     color, cover = photographed(camera, color, background), over(view, color, background)
@@ -166,16 +161,11 @@ def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent)
     )
     zooms = [view.zoom for view in refined.train if view.zoom is not None]
     if zooms:
-        on_event(Notice(zoom_line(zooms)))
-
-
-def zoom_line(zooms: Sequence[Zoom]) -> str:
-    """Describe the refinement of focal lengths of training views in one line."""
-    scales = sorted({zoom.scale for zoom in zooms})
-    factor = f"{scales[0]:.4f}" if len(scales) == 1 else f"{scales[0]:.4f} to {scales[-1]:.4f} ({len(scales)} cameras)"
-    moved = max(max(abs(zoom.right), abs(zoom.down)) for zoom in zooms)
-    also = f", principal points moved by up to {moved:.4f} focal lengths" if moved else ""
-    return f"refined focal lengths are {factor} times those of the capture{also}"
+        scales = sorted({zoom.scale for zoom in zooms})
+        several = f" to {scales[-1]:.4f} ({len(scales)} cameras)" if len(scales) > 1 else ""
+        moved = max(max(abs(zoom.right), abs(zoom.down)) for zoom in zooms)
+        also = f", principal points moved by up to {moved:.4f} focal lengths" if moved else ""
+        on_event(Notice(f"refined focal lengths are {scales[0]:.4f}{several} times those of the capture{also}"))
 
 
 def _frame(view: View, root: Path | None) -> dict[str, Any]:
@@ -239,12 +229,7 @@ def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
 
 
 def aligned(
-    splats: Splats,
-    views: Sequence[View],
-    settings: RasterSettings,
-    backend: Backend,
-    extent: float,
-    on_event: OnEvent,
+    splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend, extent: float, on_event: OnEvent
 ) -> Iterator[View]:
     """Yield views with their cameras aligned to their photographs, by the photometric loss of the fixed splats.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import gc
-import os
 
 import torch
 
 from gs2d.core.memory import trim
 from gs2d.core.memory_limit import CACHE_FRACTION, memory_limit, set_memory_budget
+from gs2d.core.processes import available_cores
 from gs2d.data import Scene
 from gs2d.errors import DataError, RecipeError
 from gs2d.kernels.library import available_variants, load
@@ -28,12 +28,15 @@ def use_threads(threads: int | None, processes: int = 1) -> None:
             raise RecipeError(f"--threads must be a whole number from 1 to {MAX_THREADS}, got {threads}")
         torch.set_num_threads(threads)
     elif processes > 1:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        torch.set_num_threads(max(1, cores // processes))
+        torch.set_num_threads(max(1, available_cores() // processes))
 
 
-def use_memory(gib: float | None) -> None:
-    """Limit memory to ``gib`` GiB; None: to half of this machine or container."""
+def use_memory(gib: float | None, processes: int = 1) -> None:
+    """Limit memory to ``gib`` GiB; None: to half of this machine or container. ``processes`` of a machine share it."""
+    if processes > 1:
+        limit = memory_limit()
+        total = gib if gib is not None else None if limit is None else limit.bytes / 2**30
+        gib = None if total is None else total / processes
     if gib is not None and not LEAST_GIB <= gib < 1 << 20:
         raise RecipeError(f"--memory must be at least {LEAST_GIB:g} GiB, got {gib:g}")
     set_memory_budget(None if gib is None else int(gib * 2**30))
@@ -42,12 +45,8 @@ def use_memory(gib: float | None) -> None:
 def check_memory(scene: Scene, downscale: int, *, on_host: bool) -> None:
     """Raise DataError if the photographs are too large to train on in the available memory.
 
-    Parameters
-    ----------
-    downscale : int
-        Factor by which its photographs are smaller than their files.
-    on_host : bool
-        Whether the CPU trains; for other devices, this memory only decodes photographs.
+    They are smaller than their files by ``downscale``. ``on_host``: the CPU trains; for other devices, this memory only
+    decodes photographs.
     """
     fitting, need = least_downscale(scene, downscale, on_host=on_host)
     if fitting == downscale:
@@ -59,10 +58,7 @@ def check_memory(scene: Scene, downscale: int, *, on_host: bool) -> None:
 def least_downscale(scene: Scene, downscale: int, *, on_host: bool) -> tuple[int | None, str]:
     """Return the smallest downscale, from that of a scene on, at which training fits into memory.
 
-    Returns
-    -------
-    (int or None, str)
-        None: decoding does not fit at any downscale. The text compares required and available memory.
+    It is None if decoding does not fit at any. The text compares required and available memory.
     """
     limit = memory_limit()
     if limit is None:

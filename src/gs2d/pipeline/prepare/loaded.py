@@ -24,7 +24,7 @@ from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_re
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
 from gs2d.pipeline.prepare.options import TrainOptions, values
-from gs2d.pipeline.prepare.resolve import check_execution, check_options, resolve, schedule_scale_of
+from gs2d.pipeline.prepare.resolve import check_options, resolve, schedule_scale_of
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
@@ -34,24 +34,15 @@ from gs2d.training.trainer import TrainerOptions, raster_settings
 
 @dataclass(frozen=True, eq=False)
 class LoadedRun:
-    """A resolved run with everything in memory, ready to train.
-
-    Attributes
-    ----------
-    init : Splats or None
-        Initial splats; None: from points.
-    options : TrainerOptions
-        Further inputs of the trainer, for a part of a scene.
-    processes : int
-        Number of processes that train together.
-    """
+    """A resolved run with everything in memory, ready to train."""
 
     resolved: ResolvedRun
     scene: Scene
     backend: Backend
-    init: Splats | None = None
+    init: Splats | None = None  # initial splats; None: from points
+    # Further inputs of the trainer, for a part of a scene.
     options: TrainerOptions = field(default_factory=TrainerOptions)
-    processes: int = 1
+    processes: int = 1  # number of processes that train together
 
     @property
     def recipe(self) -> Recipe:
@@ -67,11 +58,6 @@ class LoadedRun:
     def settings(self) -> RasterSettings:
         """The constants of the rasterizer."""
         return self.resolved.raster
-
-    @property
-    def downscale(self) -> int:
-        """Factor by which the photographs are smaller than their files."""
-        return self.resolved.downscale
 
     def stage_key(self, index: int, processes: Sequence[tuple[int, ...]] | None = None) -> str:
         """Return a hash of everything that determines the bytes of the state at the end of stage ``index``.
@@ -124,29 +110,16 @@ RenderedScene = LoadedRun | Trained
 # -- before training ---------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainedPart:
-    """A part of a scene with its own recipe and protocol; only its splats are written.
-
-    Attributes
-    ----------
-    views : tuple of str
-        Names of the training views, without test views; (): the split of the capture.
-    extent : float or None
-        World units; None: that of the capture.
-    own : Splats or None
-        The splats that are trained; None: initialised from points.
-    options : TrainerOptions
-        The frozen splats around them, the region of a dense start, and given exposures.
-    digest : str or None
-        Hash of ``own`` and ``options``.
-    """
+    """A part of a scene with its own recipe and protocol; only its splats are written."""
 
     recipe: Recipe
     protocol: Protocol
-    views: tuple[str, ...] = ()
-    extent: float | None = None
-    own: Splats | None = None
+    views: tuple[str, ...] = ()  # names of the training views, without test views; (): the split of the capture
+    extent: float | None = None  # world units; None: that of the capture
+    own: Splats | None = None  # the splats that are trained; None: initialised from points
+    # The frozen splats around them, the region of a dense start, and given exposures.
     options: TrainerOptions = field(default_factory=TrainerOptions)
-    digest: str | None = None
+    digest: str | None = None  # hash of `own` and `options`
 
     def scene_of(self, scene: Scene) -> Scene:
         """Return the scene with the views and the extent of the part."""
@@ -168,17 +141,12 @@ def prepare_run(
 ) -> LoadedRun:
     """Check the options, read the capture and resolve the run. Writes nothing.
 
-    Parameters
-    ----------
-    title : str
-        Heading of the report; empty: the name of the capture.
-    part : TrainedPart or None
-        Trains a part of the scene, with its recipe and protocol instead of those of the options.
+    ``title`` is the heading of the report; empty: the name of the capture. A ``part`` of the scene has its own recipe
+    and protocol, instead of those of the options.
     """
     if part is None:
         check_options(options)
     else:
-        check_execution(options)
         options = replace(options, protocol=part.protocol, test_every=None)
     init, init_digest = (None, None) if options.init is None else read_init(options.init, on_event)
     init = init if part is None else part.own

@@ -54,25 +54,21 @@ def quality_level(name: str, *, is_data_set: bool, on_host: bool) -> QualityLeve
 
 @dataclass(frozen=True, eq=False)
 class OpenCapture:
-    """A capture as a training sees it.
-
-    Attributes
-    ----------
-    downscale : int
-        Factor by which the photographs are smaller than their files.
-    quality : QualityLevel
-        Training length, where the options do not set it.
-    """
+    """A capture as a training sees it."""
 
     scene: Scene
     protocol: Protocol
     backend: Backend
-    downscale: int
-    quality: QualityLevel = WHOLE
+    downscale: int  # factor by which the photographs are smaller than their files
+    quality: QualityLevel = WHOLE  # training length, where the options do not set it
 
 
 def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
-    """Choose backend and protocol and load the capture; its photographs are not decoded yet."""
+    """Choose backend and protocol and load the capture; its photographs are not decoded yet.
+
+    The downscale is that of the options, of the resumed run, or by quality and memory. Raises DataError if training at
+    the requested downscale, or at any, does not fit into memory.
+    """
     backend = choose_backend(options.backend, on_event)
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
     reader_of(scene_format)  # an unknown format is an error before anything is read
@@ -83,7 +79,28 @@ def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
         placed, _, _ = placed_photographs(options.scene)
         protocol = protocol if placed is None or placed >= FEW else replace(protocol, test_every=0)
     quality = quality_level(options.quality, is_data_set=not protocol.robust, on_host=backend.on_host)
-    downscale, scene = _load_shrunk(options, scene_format, protocol, backend, quality, on_event)
+    masks, notices = Masks(options.masks, options.masked), list[Event]()
+
+    def load(factor: int, *lines: str) -> Scene:
+        notices[:] = map(Notice, lines)
+        return read_scene(options.scene, scene_format, factor, protocol, notices.append, masks)
+
+    downscale = options.downscale
+    if downscale is None and options.resume and is_run(options.out):
+        begun = RunFolder(options.out).definition().get("downscale")
+        downscale = begun if isinstance(begun, int) and begun >= 1 else None
+    scene = load(downscale or 1)
+    if downscale is None:
+        side = max(max(view.camera.width, view.camera.height) for view in scene.views)
+        downscale = 1 if quality.side is None else max(1, math.floor(side / quality.side + 0.5))
+        scene = load(downscale) if downscale > 1 else scene
+        fitting, need = least_downscale(scene, downscale, on_host=backend.on_host)
+        if fitting is not None and fitting > downscale:
+            downscale = fitting
+            scene = load(fitting, f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")
+    for event in notices:
+        on_event(event)
+    check_memory(scene, downscale, on_host=backend.on_host)
     if options.test_every is not None and scene.own_split:
         raise ProtocolError(f"--test-every: {options.scene} has a split of its own; leave the option out")
     return OpenCapture(scene, with_masks(protocol, scene, on_event), backend, downscale, quality)
@@ -139,46 +156,11 @@ def read_scene(
     for text in scene.details:
         on_event(Notice(text, detail=True))
     if scene.skipped:
-        on_event(Notice(_skipped_line(scene), is_warning=True))
+        used, more = len({view.path or view.name for view in scene.views}), len(scene.skipped) > SHOWN_SKIPS
+        count = f"{len(scene.skipped)} of {len(scene.skipped) + used} photographs are left out"
+        first = f"{'; '.join(scene.skipped[:SHOWN_SKIPS])}{' ...' if more else ''}"
+        on_event(Notice(f"{count} (`gs2d info` lists them): {first}", is_warning=True))
     return scene
-
-
-def _load_shrunk(
-    options: TrainOptions,
-    scene_format: str,
-    protocol: Protocol,
-    backend: Backend,
-    quality: QualityLevel,
-    on_event: OnEvent,
-) -> tuple[int, Scene]:
-    """Load a capture at its downscale: that of the options, of the resumed run, or by quality and memory.
-
-    Raises DataError if training at the requested downscale, or at any, does not fit into memory.
-    """
-    masks = Masks(options.masks, options.masked)
-    downscale = options.downscale
-    if downscale is None and options.resume and is_run(options.out):
-        begun = RunFolder(options.out).definition().get("downscale")
-        downscale = begun if isinstance(begun, int) and begun >= 1 else None
-    notices: list[Event] = []
-
-    def load(factor: int, *lines: str) -> Scene:
-        notices[:] = map(Notice, lines)
-        return read_scene(options.scene, scene_format, factor, protocol, notices.append, masks)
-
-    scene = load(downscale or 1)
-    if downscale is None:
-        side = max(max(view.camera.width, view.camera.height) for view in scene.views)
-        downscale = 1 if quality.side is None else max(1, math.floor(side / quality.side + 0.5))
-        scene = load(downscale) if downscale > 1 else scene
-        fitting, need = least_downscale(scene, downscale, on_host=backend.on_host)
-        if fitting is not None and fitting > downscale:
-            downscale = fitting
-            scene = load(fitting, f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")
-    for event in notices:
-        on_event(event)
-    check_memory(scene, downscale, on_host=backend.on_host)
-    return downscale, scene
 
 
 def placed_photographs(capture: Path | None) -> tuple[int | None, int | None, tuple[str, ...]]:
@@ -195,13 +177,6 @@ def placed_photographs(capture: Path | None) -> tuple[int | None, int | None, tu
         return int(data["placed"]), int(data["count"]), lost
     except (LookupError, TypeError, ValueError, OverflowError):
         return None, None, ()  # a file of this name by another program
-
-
-def _skipped_line(scene: Scene) -> str:
-    """Return one line about skipped photographs: how many, and the first with their reasons."""
-    used, more = len({view.path or view.name for view in scene.views}), len(scene.skipped) > SHOWN_SKIPS
-    count = f"{len(scene.skipped)} of {len(scene.skipped) + used} photographs are left out"
-    return f"{count} (`gs2d info` lists them): {'; '.join(scene.skipped[:SHOWN_SKIPS])}{' ...' if more else ''}"
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------

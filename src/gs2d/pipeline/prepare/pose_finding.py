@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import os
 import shutil
 import time
 from collections import Counter
@@ -20,12 +19,14 @@ import numpy as np
 
 from gs2d.core.image_arrays import natural_key
 from gs2d.core.json_files import write_json
+from gs2d.core.processes import available_cores
 from gs2d.data import load_scene
 from gs2d.data.masks import FOLDER
 from gs2d.data.positions import Positions, matched, read_positions, to_enu
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
+from gs2d.pipeline.prepare.limits import MAX_THREADS
 from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_choices, values
 from gs2d.sfm.as_fisheye import FISHEYE
 from gs2d.sfm.colmap_process import Group, Request, Solved, check_installed, layers, read_facts, solve
@@ -34,15 +35,7 @@ from gs2d.sfm.lens import START
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
 from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.photo_masks import copy_masks, masks_of
-from gs2d.sfm.photos import (
-    FEWEST,
-    Photo,
-    camera_groups,
-    find_photos,
-    in_order_taken,
-    panorama_groups,
-    read_photos,
-)
+from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, in_order_taken, panorama_groups, read_photos
 from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
 from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
@@ -62,7 +55,7 @@ from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 MANY = 500  # photographs; more: "auto" uses the global mapper (docs/notebook/sfm.md)
 ALL_PAIRS = 150  # photographs; up to this number "auto" matches every pair
 POSITIONED = 0.5  # fraction of photographs with positions from which "auto" matches spatially
-SMALLEST_SIDE, MAX_THREADS = 64, 1024
+SMALLEST_SIDE = 64
 LIMITS = {
     "max_size": (SMALLEST_SIDE, 1 << 16),
     "feature_size": (SMALLEST_SIDE, 1 << 16),
@@ -94,7 +87,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     out = options.out.resolve()
     sweep_workspace(out)
     check_out(options.out, options.photos, overwrite=options.overwrite)
-    threads = options.threads or _cores()
+    threads = options.threads or available_cores()
     made = make_folder(out.parent)
     try:
         with workspace(out) as work, _kept(work, on_event):
@@ -185,10 +178,6 @@ def _stamp(path: Path) -> tuple[str, int, int]:
     except OSError:
         return str(path), 0, 0
     return str(path), stat.st_size, stat.st_mtime_ns
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _masks_of(options: PosesOptions, photos: Sequence[Photo], is_video: bool, on_event: OnEvent) -> list[Path | None]:
@@ -380,7 +369,17 @@ def _read_models(
         "photos_per_point": best.mean_track,
         "median_angle_degrees": best.median_angle,
         "up": "+z" if best.upright else None,
-        "cameras": [_camera_facts(best, number, count) for number, count in sorted(per_camera.items())],
+        "cameras": [
+            {
+                "model": camera.model,
+                "size": [camera.width, camera.height],
+                "params": list(camera.params),
+                "focal_px": focal_length(camera),
+                "photos": count,
+                "about": camera_line(camera, count),
+            }
+            for camera, count in ((best.cameras[number], count) for number, count in sorted(per_camera.items()))
+        ],
         "lens": solved.lens,
         "other_models": [
             {"folder": f"{SPARSE}/{i}", "photos": sorted(model.names), "points": len(model.points.xyz)}
@@ -395,19 +394,6 @@ def _read_models(
             "threads": request.threads,
         },
         "created": now(),
-    }
-
-
-def _camera_facts(model: SfmModel, number: int, count: int) -> dict[str, Any]:
-    """Return the entry of a camera in ``poses.json``."""
-    camera = model.cameras[number]
-    return {
-        "model": camera.model,
-        "size": [camera.width, camera.height],
-        "params": list(camera.params),
-        "focal_px": focal_length(camera),
-        "photos": count,
-        "about": camera_line(camera, count),
     }
 
 

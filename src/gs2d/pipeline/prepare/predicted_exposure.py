@@ -28,7 +28,7 @@ GREY = 0.5
 MAX_VARIANCE = 0.9  # brightness is used if its residual variance is below this times that of neighbours
 ENOUGH = 8  # training photographs to fit a line
 METERED = 256  # px, longer side of the rendering that is metered; smaller ones widen thin splats
-LUMA = (0.299, 0.587, 0.114)
+LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 DARK = 0.02  # added to a brightness before its logarithm
 LEAST_GAIN = 0.05
 
@@ -53,12 +53,8 @@ def metered(splats: Splats, settings: RasterSettings, backend: Backend) -> Brigh
 def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
     """Return a scene with predicted exposures of test views; unchanged if training views have none.
 
-    Parameters
-    ----------
-    scene : Scene
-        With the learned appearance of its training views.
-    brightness : callable, optional
-        See :func:`metered`; without it only neighbours are used.
+    The scene has the learned appearance of its training views. ``brightness`` is that of :func:`metered`; without it
+    only neighbours are used.
     """
     if not scene.test or any("exposure" not in view.appearance for view in scene.train):
         return scene
@@ -103,13 +99,8 @@ class _Meter:
     def fitted(cls, brightness: np.ndarray, gains: np.ndarray, around: np.ndarray, trust: float) -> _Meter | None:
         """Fit the line to training views; None if it predicts no better than neighbours alone.
 
-        Parameters
-        ----------
-        brightness, gains : ndarray [V]
-        around : ndarray [V, V]
-            Weights of the others in a prediction of each.
-        trust : float
-            In neighbours alone.
+        ``brightness`` and ``gains`` are [V]; ``around`` [V, V] are the weights of the others in a prediction of each;
+        ``trust`` is that in neighbours alone.
         """
         x, y = np.log(np.maximum(brightness, 0.0) + DARK), np.log(np.maximum(gains, LEAST_GAIN))
         middle, level = float(x.mean()), float(y.mean())

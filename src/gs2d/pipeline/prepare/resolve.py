@@ -53,14 +53,8 @@ def build_recipe(
 ) -> Recipe:
     """Return the trained recipe: with the additions of the options, scaled, seeded, overridden and validated.
 
-    Parameters
-    ----------
-    schedule_scale : float
-        Fraction of the recipe's iterations.
-    iterations : int, optional
-        Total iterations, instead of ``schedule_scale``.
-    robust, exposure : bool
-        Whether training is robust, and whether it learns exposures.
+    ``schedule_scale`` is a fraction of the recipe's iterations; ``iterations``, instead, their number. ``robust`` and
+    ``exposure``: whether training is robust, and whether it learns exposures.
     """
     value = recipe_of(training.recipe)
     value = with_exposure(value) if exposure else value
@@ -96,18 +90,13 @@ def check_options(options: TrainOptions) -> None:
     scale = 1.0 if options.schedule_scale is None else options.schedule_scale
     robust, exposure = options.robust != "off", "exposure" in options.learned
     build_recipe(options, seed=options.seed, schedule_scale=scale, robust=robust, exposure=exposure)
-    check_execution(options)
+    if options.downscale is not None and options.downscale < 1:
+        raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
+    checkpoint_interval(options.checkpoint_every)
     if options.test_every is not None and options.test_every not in (0, *range(2, MAX_VIEWS)):
         raise ProtocolError(f"--test-every must be 0 (no test views) or at least 2, got {options.test_every}")
     if isinstance(options.protocol, str) and options.protocol != "auto":
         get_protocol(options.protocol)
-
-
-def check_execution(options: TrainOptions) -> None:
-    """Raise for invalid options that choose neither recipe nor protocol."""
-    if options.downscale is not None and options.downscale < 1:
-        raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
-    checkpoint_interval(options.checkpoint_every)
 
 
 def checkpoint_interval(every: str | int) -> tuple[int | None, float | None]:
@@ -141,10 +130,7 @@ def resolve(
 ) -> tuple[Recipe, OpenCapture]:
     """Return the recipe and the capture that are trained; the same for all commands.
 
-    Parameters
-    ----------
-    seed, schedule_scale, iterations
-        As for :func:`build_recipe`.
+    Seed and length are as for :func:`build_recipe`.
     """
     scene = without_masked_points(capture.scene, capture.protocol, on_event)
     robust, exposure = robust_and_exposure(training, scene, capture.protocol, on_event)

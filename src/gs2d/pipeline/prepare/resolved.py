@@ -21,31 +21,17 @@ from gs2d.render.types import RasterSettings
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureRecord:
-    """The capture of a run.
-
-    Attributes
-    ----------
-    path : Path
-        Absolute.
-    train, test : int
-        Number of views.
-    extent : float
-        World units.
-    skipped : tuple of str
-        Photographs that were skipped, with the reason.
-    digest : str
-        Hash of all decoded images, masks, cameras, points and priors.
-    """
+    """The capture of a run."""
 
     name: str
-    path: Path
+    path: Path  # absolute
     format: str
-    train: int
+    train: int  # number of training views
     test: int
-    extent: float
-    skipped: tuple[str, ...] = ()
+    extent: float  # world units
+    skipped: tuple[str, ...] = ()  # photographs that were skipped, with the reason
     masks: Masks = field(default_factory=Masks)
-    digest: str = ""
+    digest: str = ""  # hash of all decoded images, masks, cameras, points and priors
 
     @classmethod
     def of(cls, scene: Scene, digest: str) -> CaptureRecord:
@@ -78,36 +64,18 @@ class Execution:
 
 @dataclass(frozen=True, kw_only=True)
 class ResolvedRun:
-    """Everything that defines a run; names and defaults are replaced by values.
+    """Everything that defines a run; names and defaults are replaced by values."""
 
-    Attributes
-    ----------
-    recipe : Recipe
-        As trained, with its seed.
-    downscale : int
-        Factor by which the photographs are smaller than their files.
-    backend : mapping
-        What determines its results (``Backend.facts``).
-    schedule_scale : float
-        Trained fraction of the full schedule.
-    title : str
-        Heading of the report; empty: the name of the capture.
-    init : str or None
-        Hash of the file of initial splats.
-    part : str or None
-        Hash of the initial state of a part of a scene.
-    """
-
-    recipe: Recipe
+    recipe: Recipe  # as trained, with its seed
     protocol: Protocol
     scene: CaptureRecord
-    downscale: int
+    downscale: int  # factor by which the photographs are smaller than their files
     raster: RasterSettings
-    backend: Mapping[str, Any]
-    schedule_scale: float = 1.0
-    title: str = ""
-    init: str | None = None
-    part: str | None = None
+    backend: Mapping[str, Any]  # what determines its results (`Backend.facts`)
+    schedule_scale: float = 1.0  # trained fraction of the full schedule
+    title: str = ""  # heading of the report; empty: the name of the capture
+    init: str | None = None  # hash of the file of initial splats
+    part: str | None = None  # hash of the initial state of a part of a scene
     execution: Execution = field(default_factory=Execution)
 
     def to_json(self) -> dict[str, Any]:

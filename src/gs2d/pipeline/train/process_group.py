@@ -17,7 +17,6 @@ from typing import Any
 
 import torch
 
-from gs2d.core.memory_limit import memory_limit
 from gs2d.core.processes import ProcessRank, process_rank
 from gs2d.errors import BackendError, Gs2dError, RunError
 from gs2d.io.run_dir import RunFolder
@@ -30,19 +29,14 @@ from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses,
 from gs2d.training.trainer import Trainer, TrainerOptions
 
 PATIENCE = timedelta(days=7)  # the others wait while process 0 scores; a lost process is noticed by its connection
-GIB = 2**30
 
 
 @contextmanager
 def connected(backend: str) -> Iterator[OneProcess]:
     """Connect to the other processes, if the environment defines any.
 
-    Raises BackendError if a process has no GPU, or torch was built without ``torch.distributed``.
-
-    Parameters
-    ----------
-    backend : str
-        The requested backend: unless it is of the CPU, each process uses a GPU of its own.
+    Each process uses a GPU of its own, unless the requested backend is of the CPU. Raises BackendError if a process has
+    no GPU, or torch was built without ``torch.distributed``.
     """
     place = process_rank()
     if place.size == 1:
@@ -81,15 +75,6 @@ def _connect(place: ProcessRank, backend: str) -> ManyProcesses:
     return ManyProcesses(place)
 
 
-def memory_of(place: ProcessRank, gib: float | None) -> float | None:
-    """Return the memory limit of this process in GiB: an equal part of ``--memory``, or of the machine's memory."""
-    if place.local_size == 1:
-        return gib
-    limit = memory_limit()
-    total = gib if gib is not None else None if limit is None else limit.bytes / GIB
-    return None if total is None else total / place.local_size
-
-
 def lead(loaded: LoadedRun, together: OneProcess, on_event: OnEvent) -> LoadedRun:
     """Send the run to the other processes, and report how many there are."""
     if not isinstance(together, ManyProcesses):
@@ -119,10 +104,7 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
         loaded.recipe,
         loaded.protocol,
         backend=loaded.backend,
-        options=TrainerOptions(
-            progress_every=progress_every(loaded),
-            processes=together,
-        ),
+        options=TrainerOptions(progress_every=progress_every(loaded), processes=together),
     )
     signals = HeldSignals()
     together.hears = lambda: signals.pending

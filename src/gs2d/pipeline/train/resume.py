@@ -10,13 +10,7 @@ from typing import Any
 
 from gs2d.core.atomic_files import sweep
 from gs2d.errors import RunError, ShapeError
-from gs2d.io.run_dir import (
-    CheckpointFile,
-    RunFolder,
-    load_tensors,
-    make_folder,
-    save_tensors,
-)
+from gs2d.io.run_dir import CheckpointFile, RunFolder, load_tensors, make_folder, save_tensors
 from gs2d.io.run_schema import METRICS_SHAPE, check_shape
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.training.events import Notice, OnEvent
@@ -27,12 +21,8 @@ from gs2d.training.state import TrainState
 def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> tuple[TrainState | None, float]:
     """Return the furthest valid start; log and metrics are cut to it.
 
-    Raises RunError if no checkpoint is readable.
-
-    Returns
-    -------
-    (TrainState or None, float)
-        None: from nothing. The seconds of training already spent in the current stage.
+    That is a state, or None: from nothing; and the seconds of training already spent in the current stage. Raises
+    RunError if no checkpoint is readable.
     """
     cache = loaded.resolved.execution.cache
     if run.checkpoints():

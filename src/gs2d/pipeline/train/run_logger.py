@@ -15,14 +15,9 @@ from gs2d.errors import DivergedError, Gs2dError
 from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.finish.run_images import choose_views, draw_stage
+from gs2d.pipeline.finish.run_images import draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
-from gs2d.pipeline.finish.scoring import (
-    mean_psnr,
-    peak_memory,
-    score_views,
-    split_metrics,
-)
+from gs2d.pipeline.finish.scoring import mean_psnr, peak_memory, score_views, split_metrics
 from gs2d.pipeline.prepare.learned_views import write_appearance, write_poses
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
@@ -68,12 +63,8 @@ class StageClock:
 class RunLogger:
     """Records a training run. It does not change what is trained.
 
-    Parameters
-    ----------
-    seconds : float
-        Training time already spent in the current stage.
-    collected : Collector or None
-        Measures every view of the finished splats.
+    ``seconds`` is the training time already spent in the current stage; ``collected`` measures every view of the
+    finished splats.
     """
 
     def __init__(
@@ -83,7 +74,7 @@ class RunLogger:
         trainer: Trainer,
         seconds: float,
         on_event: OnEvent,
-        collected: Collector | None = None,
+        collected: Collector | None,
     ) -> None:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
         self._collected = collected
@@ -162,7 +153,7 @@ class RunLogger:
 
     # -- the log -------------------------------------------------------------------------------------------------------
     def _log(self, event: events.TrainingEvent, **extra: Any) -> None:
-        facts = {name: value for name, value in asdict(event).items() if _storable(value)}
+        facts = {k: v for k, v in asdict(event).items() if not isinstance(v, float) or math.isfinite(v)}
         self._run.events.append({"kind": event.kind, **facts, **extra})
 
     def _on_progress(self, event: events.Progress) -> None:
@@ -261,7 +252,7 @@ class RunLogger:
 
     def _score_stage(self, index: int, facts: Mapping[str, Any]) -> None:
         """Score and draw a finished stage, write its entry of ``metrics.json``, put it into the cache."""
-        stage, last, splats = self._stage(index), self._is_last(index), self._trainer.splats
+        stage, splats = self._stage(index), self._trainer.splats
         entry: dict[str, Any] = {
             "name": stage.name,
             "iterations": stage.iterations,
@@ -269,19 +260,15 @@ class RunLogger:
             "bytes": splats.nbytes,
             **facts,
         }
-        collected = self._collected if last else None
+        collected = self._collected if self._is_last(index) else None
         for split in ("train", "test"):
             entry |= {split: None, f"{split}_reason": "its views could not be scored"}
             with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
                 scene, loaded = self._shown_scene(), self._loaded
+                views, drawing = scene.train if split == "train" else scene.test, (loaded.settings, loaded.backend)
+                visitors = [] if collected is None else [collected.visit]
                 scores = score_views(
-                    self._trainer.drawn,
-                    scene.train if split == "train" else scene.test,
-                    loaded.settings,
-                    loaded.backend,
-                    self._on_event,
-                    split=split,
-                    visitors=[] if collected is None else [collected.visit],
+                    self._trainer.drawn, views, *drawing, self._on_event, split=split, visitors=visitors
                 )
                 del entry[f"{split}_reason"]
                 entry |= split_metrics(scores, split)
@@ -299,7 +286,7 @@ class RunLogger:
         drawn, state = self._trainer.drawn, self._trainer.state
         with attempted(f"images of stage {stage}", None, self._on_event):
             group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # no frozen splats
-            draw_stage(self._run, self._loaded, choose_views(self._shown_scene()), stage, drawn, group)
+            draw_stage(self._run, self._loaded, self._shown_scene(), stage, drawn, group)
 
     def _shown_scene(self) -> Scene:
         """Return the scene with its learned appearance, and predicted exposures of its test views."""
@@ -333,10 +320,6 @@ def progress_every(loaded: LoadedRun) -> int:
     """Return the iterations between progress events."""
     every = REPORT_EVERY if loaded.backend.on_host else REPORT_EVERY_ON_GPU
     return min(every, checkpoint_interval(loaded.resolved.execution.checkpoint_every)[0] or every)
-
-
-def _storable(value: Any) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)
 
 
 def start_text(event: events.Initialised) -> str:

@@ -35,7 +35,7 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, TrainedPart, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.live import Live
-from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
+from gs2d.pipeline.train.process_group import connected, follow, lead
 from gs2d.pipeline.train.resume import choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, TrainingEvent, ignore
@@ -77,11 +77,10 @@ def train(
     """
     with connected(options.backend) as together:
         use_threads(options.threads, together.place.local_size)
-        use_memory(memory_of(together.place, options.memory))
+        use_memory(options.memory, together.place.local_size)
         if isinstance(together, ManyProcesses) and not together.leads:
             return follow(options, together)
-        check_viewer(options)
-        check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
+        check_places(options, allowed)
         heard: list[Event] = []
 
         def listen(event: Event) -> None:
@@ -89,14 +88,14 @@ def train(
             on_event(event)
 
         loaded = prepare_run(options, listen, title=title, part=part)
-        if options.overwrite and options.cache is not None:  # before the old run is deleted
-            remove_made(make_folder(options.cache))
         run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
-        page = nullcontext() if options.viewer is None else closing(Live(loaded, on_event))
-        with run.locked(), discard_on_failure(run), page as live:
+        with (
+            run.locked(),
+            discard_on_failure(run),
+            nullcontext() if options.viewer is None else closing(Live(loaded, on_event)) as live,
+        ):
             tell = on_event if live is None else live.on_event
-            if options.cache is not None:  # an unusable folder fails here, not after the first stage
-                run.made += make_folder(options.cache)
+            run.made += () if options.cache is None else make_folder(options.cache)
             if is_run(run.path):
                 check_same_run(run, loaded.resolved)
                 if run.file(EDITS).exists():
@@ -117,9 +116,8 @@ def train(
                 tell(Notice(_training_line(loaded)))
                 if part is None:
                     known = None if loaded.init is None else len(loaded.init)
-                    needed = estimate(
-                        loaded.scene, loaded.recipe, loaded.backend, downscale=loaded.downscale, start=known
-                    )
+                    shrunk = loaded.resolved.downscale
+                    needed = estimate(loaded.scene, loaded.recipe, loaded.backend, downscale=shrunk, start=known)
                     tell(Notice(needed.line()))
                 for event in heard:
                     if isinstance(event, Notice) and event.detail:
@@ -133,10 +131,13 @@ def train(
         return run
 
 
-def check_viewer(options: TrainOptions) -> None:
-    """Raise if the page of ``--viewer`` cannot be served."""
+def check_places(options: TrainOptions, allowed: tuple[str, ...] = ()) -> None:
+    """Raise for a run folder, port or cache that cannot be used; ``allowed`` is as for :func:`train`."""
+    check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     if options.viewer is not None:
         free_port(options.viewer or None, option="--viewer")
+    if options.cache is not None:  # an unusable folder fails here, not after the first stage
+        remove_made(make_folder(options.cache))
 
 
 @contextmanager
@@ -159,14 +160,9 @@ def train_stages(
     together: OneProcess,
     live: Live | None,
 ) -> tuple[Splats, Scene]:
-    """Train from ``start`` (:func:`choose_start`) to the end of the last stage.
+    """Train from ``start`` (:func:`choose_start`) to the end; return the splats, and the scene with refined cameras.
 
     The splats are written before they are scored. ``collected`` measures every view of the finished splats.
-
-    Returns
-    -------
-    (Splats, Scene)
-        The scene has its refined cameras.
     """
 
     def listen(event: TrainingEvent) -> None:
