@@ -28,6 +28,7 @@ from gs2d.training.start.sweep_range import SweepRange, sweep_range
 
 PLANES = 64  # depths that are tried for each pixel
 MIN_NCC = 0.5  # depths with a lower NCC are unknown
+FUSIONS = 3  # rounds of averaging with the depth maps of neighbours
 AGREE = 0.02  # depths of two views agree when they differ by at most this fraction
 VOTES = 2  # neighbours that must agree on the depth of a splat
 MAX_VIEWS = 120  # images that are swept, evenly chosen, beside those that they are compared with
@@ -168,7 +169,33 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     views = Spilled(_trimming(_shrunk(view, known, factor) for view in scene.train), limit)
     neighbours = _neighbours(scene, views, known.observed, settings)
     found = Spilled(_trimming(_depths(views, index, neighbours[index]) for index in range(len(views))), limit)
-    return Sweep(views, neighbours, found.column(0), found.column(1))
+    depths: Sequence[np.ndarray] = found.column(0)
+    for _ in range(FUSIONS):
+        before = depths
+        depths = Spilled((averaged(views, before, index, others) for index, others in enumerate(neighbours)), limit)
+    return Sweep(views, neighbours, depths, found.column(1))
+
+
+def averaged(
+    views: Sequence[SmallView], depths: Sequence[np.ndarray], index: int, neighbours: Sequence[int]
+) -> np.ndarray:
+    """Return the depth map [H, W] of a view, averaged in 1 / z with those of the neighbours that agree.
+
+    Errors of the cameras shift whole depth maps, differently for each pair, so they do not average out within a map.
+    """
+    depth = depths[index]
+    known = depth > 0
+    places, own = unproject(views[index], depth)[known], depth[known]
+    total, count = 1 / own, np.ones(len(own))
+    for other in neighbours:
+        z, column, row, inside = project(views[other], places)
+        there = depths[other][row, column]
+        agrees = inside & (there > 0) & (np.abs(there - z) <= AGREE * z)
+        total[agrees] += z[agrees] / (own * np.where(there > 0, there, 1))[agrees]
+        count += agrees
+    averaged = np.zeros_like(depth)
+    averaged[known] = count / total
+    return averaged
 
 
 def sweep_downscale(scene: Scene, settings: DenseStart) -> int:
