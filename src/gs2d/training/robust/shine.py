@@ -14,8 +14,9 @@ Losses take shiny pixels for pixels without texture.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import partial
 
 import numpy as np
 import torch
@@ -36,6 +37,7 @@ WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are made ane
 MATT, SHINY, RARELY, OFTEN = 0.1, 0.2, 0.1, 0.3  # as in mesh refinement
 CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny things have matt-looking spots
 TINY = 1e-12
+WORKERS = 4  # threads; those of the library come on top
 LEAST = 0.05  # mean weight below which a cell is matt: no texture, which flatness tells
 
 
@@ -81,24 +83,26 @@ def shine_maps(
     """
     settings = settings.for_depths("transmittance")
 
-    @cache
-    def seen(index: int) -> _Seen:
+    def drawn(index: int) -> _Seen:
         image = image_at(index)
         output = rasterize(splats, image.camera, settings, backend=backend)
         depth = torch.where(output.alpha > 0.5, output.depth("transmittance"), 0.0).cpu().numpy()
         inner = DrawnMesh(np.zeros(0, np.int32), depth).inner(image.camera.fx)
         return _Seen(replace(image, usable=inner if image.usable is None else inner & image.usable), depth)
 
-    maps = np.zeros((len(neighbours), CELLS, CELLS))
-    for index, others in enumerate(neighbours):
-        if others:
-            maps[index] = _shine(seen(index), [seen(other) for other in others], library)
-    confirmed = np.zeros(maps.shape, np.uint8)
-    for index, others in enumerate(neighbours):
-        if others:
-            there = _shown_by(seen(index), [(seen(other).image.camera, maps[other]) for other in others])
-            confirmed[index] = np.rint(255 * np.minimum(maps[index], there))
-    return torch.from_numpy(confirmed)
+    # All views that are compared, in memory: at most 120 and their neighbours, downscaled.
+    compared = {index: others for index, others in enumerate(neighbours) if others}
+    seen = {index: drawn(index) for index in sorted({*compared, *(one for others in neighbours for one in others)})}
+    maps, confirmed = np.zeros((2, len(neighbours), CELLS, CELLS))
+    with ThreadPoolExecutor(min(WORKERS, torch.get_num_threads())) as pool:
+        beside = ([seen[other] for other in others] for others in compared.values())
+        found = pool.map(partial(_shine, library=library), map(seen.__getitem__, compared), beside)
+        for index, shine in zip(compared, found, strict=True):
+            maps[index] = shine
+    for index, others in compared.items():
+        there = _shown_by(seen[index], [(seen[other].image.camera, maps[other]) for other in others])
+        confirmed[index] = np.minimum(maps[index], there)
+    return torch.from_numpy(np.rint(255 * confirmed).astype(np.uint8))
 
 
 def _shine(view: _Seen, beside: Sequence[_Seen], library: Library) -> np.ndarray:
