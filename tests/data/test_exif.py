@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import ExifTags, Image
 
-from gs2d.data.exif import Taken, read_place, read_taken
+from gs2d.data.exif import Taken, read_taken
 
 
 def write(path: Path, *, gps: dict[int, object] | None = None, time: str = "", part: str = "") -> Path:
@@ -43,7 +43,6 @@ def test_the_position_has_signs_and_an_optional_height(tmp_path: Path) -> None:
 @pytest.mark.parametrize("place", [None, gps(141.0, 8.0), gps(0.0, 0.0)], ids=["none", "no latitude", "no fix"])
 def test_an_invalid_position_is_ignored(tmp_path: Path, place: dict[int, object] | None) -> None:
     assert read_taken(write(tmp_path / "a.jpg", gps=place)).place is None
-    assert read_place(tmp_path / "a.jpg") is None
 
 
 @pytest.mark.parametrize("time", ["0000:00:00 00:00:00", "yesterday", "2026:13:01 10:00:59"])

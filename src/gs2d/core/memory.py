@@ -12,52 +12,37 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-__all__ = ["hold", "trim"]
-
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 MAPPED_BYTES = 32 << 20  # larger blocks are mapped separately; the maximum of glibc
 HELD_BYTES = 256 << 20  # free memory kept at the end of the heap; more than an iteration with 300,000 splats frees
 
 
 @cache
-def hold() -> bool:
-    """Let the C library keep the memory that an iteration frees for the next one; ``trim`` still returns it.
-
-    By default glibc returns the end of its heap when more than twice the largest block is free there. Then every
-    iteration gets new, zeroed pages, which took a sixth of its time at 181,000 splats.
-
-    Returns
-    -------
-    bool
-        Whether it took effect: with glibc, unless the user configures malloc (MALLOC_...).
-    """
-    if any(name.startswith("MALLOC_") for name in os.environ) or "glibc.malloc" in os.environ.get("GLIBC_TUNABLES", ""):
-        return False
+def _function(name: str) -> Callable[..., Any] | None:
+    """Return a function of glibc; None with another C library."""
     try:
-        call = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):
-        return False
-    return bool(call(M_MMAP_THRESHOLD, MAPPED_BYTES) and call(M_TRIM_THRESHOLD, HELD_BYTES))
-
-
-@cache
-def _malloc_trim() -> Callable[[int], Any] | None:
-    """Return glibc's ``malloc_trim``; None with another C library."""
-    try:
-        return ctypes.CDLL(None).malloc_trim
+        return getattr(ctypes.CDLL(None), name)
     except (AttributeError, OSError, TypeError):
         return None
 
 
-def trim() -> bool:
-    """Return the free pages of the C library to the operating system.
+@cache
+def hold() -> None:
+    """Let the C library keep the memory that an iteration frees for the next one; ``trim`` still returns it.
 
-    Returns
-    -------
-    bool
-        Whether the C library supports it (glibc).
+    By default glibc returns the end of its heap when more than twice the largest block is free there. Then every
+    iteration gets new, zeroed pages, which took a sixth of its time at 181,000 splats. Without effect with other C
+    libraries, and if the user configures malloc (MALLOC_...).
     """
-    call = _malloc_trim()
+    if any(name.startswith("MALLOC_") for name in os.environ) or "glibc.malloc" in os.environ.get("GLIBC_TUNABLES", ""):
+        return
+    call = _function("mallopt")
+    if call is not None and call(M_MMAP_THRESHOLD, MAPPED_BYTES):
+        call(M_TRIM_THRESHOLD, HELD_BYTES)
+
+
+def trim() -> None:
+    """Return the free pages of the C library to the operating system, if it is glibc."""
+    call = _function("malloc_trim")
     if call is not None:
         call(0)
-    return call is not None

@@ -11,15 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = [
-    "MemoryLimit",
-    "address_space",
-    "cache_bytes",
-    "memory_budget",
-    "memory_limit",
-    "set_memory_budget",
-]
-
 CACHE_FRACTION = 0.2  # of the free memory, for a cache
 BUDGET_FRACTION = 0.5  # of the limit, default budget of a command
 _UNLIMITED = 1 << 60  # cgroup v1 reports about 2^63 for no limit

@@ -10,8 +10,6 @@ from torch import Tensor
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 
-__all__ = ["MAX_DEGREE", "harmonics", "num_coefficients", "rgb_to_sh0", "sh_basis", "sh_degree_of", "sh_to_rgb"]
-
 MAX_DEGREE = 3
 
 # Normalisation constants of the real spherical harmonics (Condon-Shortley phase), as in 3DGS:

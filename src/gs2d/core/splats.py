@@ -12,14 +12,7 @@ from torch import Tensor
 from gs2d.core.checks import check_shapes
 
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
-IMAGES = (
-    "color",
-    "alpha",
-    "normal",
-    "depth_mean",
-    "depth_median",
-    "distortion",
-)
+IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 """Output images of a rendering, in the order of the kernels."""
 
 

@@ -15,12 +15,10 @@ _HIDDEN_IN_LINES = re.compile(_HIDDEN.pattern.replace(r"\x00-\x1f", r"\x00-\x08\
 
 def name_bytes(text: str) -> bytes:
     """Encode text as UTF-8; surrogates become the original bytes of the file name."""
-    return text.encode("utf-8", "surrogateescape" if not _has_other_surrogates(text) else "surrogatepass")
-
-
-def _has_other_surrogates(text: str) -> bool:
-    """Whether there are surrogates that do not stand for a byte, as from JSON."""
-    return any("\ud800" <= letter <= "\udfff" and not "\udc80" <= letter <= "\udcff" for letter in text)
+    try:
+        return text.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:  # surrogates that do not stand for a byte, as from JSON
+        return text.encode("utf-8", "surrogatepass")
 
 
 def printable(text: str, *, lines: bool = False) -> str:

@@ -17,21 +17,6 @@ from gs2d.core.sh import num_coefficients, sh_basis
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 
-__all__ = [
-    "camera_extent",
-    "camera_outliers",
-    "common_motion",
-    "focus_point",
-    "harmonics_rotation",
-    "nearest_distances",
-    "perturb_pose",
-    "quats_to_matrices",
-    "se3_exp",
-    "similarity_motions",
-    "transform_splats",
-    "up_direction",
-]
-
 OUTLIER = 50  # multiple of the median distance; below, training is not affected
 _SPREAD = 0.02  # smallest mean square spread of the horizontal axes for estimating up
 
@@ -209,14 +194,7 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     Returns
     -------
     ndarray [3] world units
-
-    Raises
-    ------
-    ShapeError
-        If there is no camera.
     """
-    if not cameras:
-        raise ShapeError("focus_point needs at least one camera, got none")
     centers = np.stack([camera.center for camera in cameras])  # [V, 3]
     axes = np.stack([camera.forward for camera in cameras])
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3] onto the plane across each axis
@@ -246,14 +224,7 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     """Return 1.1 x the largest distance of a camera from the mean centre, world units (scene extent of 2DGS).
 
     Ignores outliers (:func:`camera_outliers`). 0 for a single camera.
-
-    Raises
-    ------
-    ShapeError
-        If there is no camera.
     """
-    if not cameras:
-        raise ShapeError("camera_extent needs at least one camera, got none")
     outliers = camera_outliers(cameras)
     centers = np.stack([camera.center for i, camera in enumerate(cameras) if i not in outliers])
     return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())

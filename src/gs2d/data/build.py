@@ -49,8 +49,6 @@ _LENSES = (0.01, 1e5)  # focal length / side: fields of view from 178.9 degrees 
 _COARSE, _TOO_COARSE = 1e-5, 1e-3
 _FARTHEST = 1e12  # world units from the origin; its cube is still a float32 number
 
-LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PosedImage:
@@ -128,58 +126,50 @@ class Capture:
     is_synthetic: bool = False
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Decoder:
-    """Decodes, undistorts and downscales one image and its masks."""
+def decode(frame: PosedImage, downscale: int) -> DecodedImage:
+    """Decode, undistort and downscale an image and its masks."""
+    k = frame.intrinsics
+    image = read_image(frame.path)
+    if image.shape[:2] != (k.height, k.width):
+        raise DataError(
+            f"image {frame.path} must be {k.width}x{k.height}, got {image.shape[1]}x{image.shape[0]}; "
+            "did the file change since the scene was loaded?"
+        )
+    mask = _sized_mask(frame.mask, k, need=0.5 if frame.mask_is_alpha else 1.0)
+    object_mask = _sized_mask(frame.object_mask, k, need=0.5)
+    if frame.alpha_is_silhouette and image.shape[2] == 4:
+        object_mask = image[:, :, 3] >= 128 if object_mask is None else object_mask
+        image = image[:, :, :3]
+    if frame.mask_is_alpha:
+        if mask is not None and object_mask is not None:
+            object_mask = object_mask & mask
+        image, mask = cut_out(image, mask), None
+    valid = None
+    if k.lens is not None:
+        positions, inside = source_positions(k) if frame.face is None else face_positions(k, frame.face)
+        image = wrapped(image, k)
+        mask, object_mask = (None if a is None else wrapped(a, k) for a in (mask, object_mask))
+        valid = inside
+        image = undistort_image(image, positions, inside)
+        mask = None if mask is None else inside & undistort_mask(mask, positions, need=1.0)
+        if object_mask is not None:
+            object_mask = inside & undistort_mask(object_mask, positions, need=0.5)
+    small = DecodedImage(image, mask, object_mask, valid).downscaled(downscale)
+    mask, valid = (None if pixels is None or pixels.all() else pixels for pixels in (small.mask, small.valid))
+    image = np.ascontiguousarray(small.image)
+    return DecodedImage(image, valid if mask is None else mask, small.object_mask, valid)
 
-    frame: PosedImage
-    downscale: int
-    lens_maps: LensMaps
 
-    def __call__(self) -> DecodedImage:
-        """Return the decoded image."""
-        frame, k = self.frame, self.frame.intrinsics
-        image = read_image(frame.path)
-        if image.shape[:2] != (k.height, k.width):
-            raise DataError(
-                f"image {frame.path} must be {k.width}x{k.height}, got {image.shape[1]}x{image.shape[0]}; "
-                "did the file change since the scene was loaded?"
-            )
-        mask = self._read_mask(frame.mask, need=0.5 if frame.mask_is_alpha else 1.0)
-        object_mask = self._read_mask(frame.object_mask, need=0.5)
-        if frame.alpha_is_silhouette and image.shape[2] == 4:
-            object_mask = image[:, :, 3] >= 128 if object_mask is None else object_mask
-            image = image[:, :, :3]
-        if frame.mask_is_alpha:
-            if mask is not None and object_mask is not None:
-                object_mask = object_mask & mask
-            image, mask = cut_out(image, mask), None
-        valid = None
-        if k.lens is not None:
-            positions, inside = self.lens_maps(k) if frame.face is None else face_positions(k, frame.face)
-            image = wrapped(image, k)
-            mask, object_mask = (None if a is None else wrapped(a, k) for a in (mask, object_mask))
-            valid = inside
-            image = undistort_image(image, positions, inside)
-            mask = None if mask is None else inside & undistort_mask(mask, positions, need=1.0)
-            if object_mask is not None:
-                object_mask = inside & undistort_mask(object_mask, positions, need=0.5)
-        small = DecodedImage(image, mask, object_mask, valid).downscaled(self.downscale)
-        mask, valid = (None if pixels is None or pixels.all() else pixels for pixels in (small.mask, small.valid))
-        image = np.ascontiguousarray(small.image)
-        return DecodedImage(image, valid if mask is None else mask, small.object_mask, valid)
-
-    def _read_mask(self, path: Path | None, need: float) -> np.ndarray | None:
-        """Return a mask at image size: True where at least ``need`` of the pixel area is white."""
-        if path is None:
-            return None
-        mask = read_mask(path)
-        k = self.frame.intrinsics
-        if mask.shape == (k.height, k.width):
-            return mask
-        # A mask of another size (full-size masks beside images_4); its aspect ratio was checked at load.
-        grey = Image.fromarray(mask.astype(np.uint8) * np.uint8(255))
-        return np.asarray(grey.resize((k.width, k.height), Image.Resampling.BOX)) >= 255 * need
+def _sized_mask(path: Path | None, k: Intrinsics, need: float) -> np.ndarray | None:
+    """Return a mask at image size: True where at least ``need`` of the pixel area is white."""
+    if path is None:
+        return None
+    mask = read_mask(path)
+    if mask.shape == (k.height, k.width):
+        return mask
+    # A mask of another size (full-size masks beside images_4); its aspect ratio was checked at load.
+    grey = Image.fromarray(mask.astype(np.uint8) * np.uint8(255))
+    return np.asarray(grey.resize((k.width, k.height), Image.Resampling.BOX)) >= 255 * need
 
 
 @contextmanager
@@ -255,7 +245,6 @@ def build_scene(
         raise DataError(f"downscale must be >= 1 and test_every >= 0, got {downscale} and {test_every}")
     factor = max(1, downscale // capture.downscaled_by)
     cache = ImageCache(cache_bytes, spills=True)
-    lens_maps = functools.lru_cache(maxsize=4)(source_positions)  # 12 bytes per pixel; cameras are mostly shared
     frames, mask_notes, masks = _with_masks(capture, root, masks)
     frames = sorted((fit_to_file(frame) for frame in frames), key=lambda frame: frame.name)
     frames, cut = _cut(frames)
@@ -264,7 +253,7 @@ def build_scene(
         twice = next(a for a, b in itertools.pairwise(names) if a == b)
         raise DataError(f"{root} has several views named {twice}; names must be unique")
     frames, map_notes = (frames, ()) if cut else _with_maps(frames, capture.home or root)
-    views = [_view(frame, factor, cache, lens_maps) for frame in frames]
+    views = [_view(frame, factor, cache) for frame in frames]
     outliers = camera_outliers([view.camera for view in views])
     try:
         train, test = _split(frames, views, capture.default_test_every, test_every, root, set(outliers))
@@ -339,7 +328,7 @@ def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tupl
     return extent, (f"{what}: fine detail is lost; subtract an offset from the poses and points",)
 
 
-def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps) -> View:
+def _view(frame: PosedImage, factor: int, cache: ImageCache) -> View:
     k = frame.intrinsics
     if not all(_LENSES[0] <= f / side <= _LENSES[1] for f, side in ((k.fx, k.width), (k.fy, k.height))):
         raise DataError(
@@ -352,9 +341,10 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
         camera = camera.downscaled(factor)
     except ShapeError as error:
         raise DataError(f"view {frame.name}: {error}") from error
-    maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera, lens_maps)
+    maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera)
     is_face = frame.face is not None
-    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps, seen, is_face=is_face)
+    read = functools.partial(decode, frame, factor)
+    return View(frame.name, camera, read, cache, frame.path, maps, seen, is_face=is_face)
 
 
 def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...]]:
@@ -453,22 +443,19 @@ def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedI
 
 def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], tuple[str, ...]]:
     """Return the frames with their maps in ``depths`` and ``normals``, and a note per folder."""
-    found: dict[str, list[Path | None]] = {}
+    notes = []
     for what, folder, suffixes in (("depth", DEPTHS, DEPTH_SUFFIXES), ("normal", NORMALS, NORMAL_SUFFIXES)):
-        if (at := in_any_case(home, folder)).is_dir():
-            found[what] = find_maps(at, [frame.name for frame in frames], suffixes)
-    for what, paths in found.items():
+        if not (at := in_any_case(home, folder)).is_dir():
+            continue
+        paths = find_maps(at, [frame.name for frame in frames], suffixes)
         for index, path in enumerate(paths):
             maps = frames[index].maps or MapFiles()
             if path is not None and getattr(maps, what) is None:
-                frames[index] = replace(
-                    frames[index], maps=replace(maps, depth=path) if what == "depth" else replace(maps, normal=path)
-                )
-    return frames, tuple(
-        f"{what} maps: {sum(path is not None for path in paths)} of {len(frames)} views have one in {what}s "
-        f"(--{what}-prior uses them)"
-        for what, paths in found.items()
-    )
+                change: dict[str, Any] = {what: path}
+                frames[index] = replace(frames[index], maps=replace(maps, **change))
+        count = len(paths) - paths.count(None)
+        notes.append(f"{what} maps: {count} of {len(frames)} views have one in {what}s (--{what}-prior uses them)")
+    return frames, tuple(notes)
 
 
 def _split(

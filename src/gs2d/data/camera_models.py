@@ -31,8 +31,6 @@ from scipy.optimize import brentq
 from gs2d.config.registry import Register, Registry
 from gs2d.errors import DataError
 
-__all__ = ["CAMERA_MODELS", "PANORAMA", "CameraModel", "Lens", "model_of", "register_camera_model"]
-
 PANORAMA = "equirectangular"
 _SMALLEST = 1e-12  # radius, so that nothing is divided by 0
 

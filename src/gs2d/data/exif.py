@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import ExifTags, Image
 
 from gs2d.data.image_files import open_image
@@ -68,12 +67,6 @@ def read_taken(path: Path) -> Taken:
     except DAMAGED_EXIF:
         return Taken()
     return Taken(orientation if orientation in _ORIENTATIONS else _UPRIGHT, made_by, place, seconds, panorama)
-
-
-def read_place(path: Path) -> np.ndarray | None:
-    """Return latitude, longitude and height [3] of an image, or None; see :class:`Taken`."""
-    place = read_taken(path).place
-    return None if place is None else np.array(place)
 
 
 def _xmp(file: Image.Image) -> str:

@@ -173,11 +173,6 @@ def in_any_case(home: Path, name: str) -> Path:
     return home
 
 
-def files_ending(folder: Path, ending: str) -> list[Path]:
-    """Return the entries of a folder with a suffix, in any letter case, sorted by name."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ending)
-
-
 def name_below(path: Path, folders: Sequence[Path]) -> str:
     """Return the path relative to the first folder that contains it, else the whole path, with ``/``."""
     inside = next((path.relative_to(folder) for folder in folders if path.is_relative_to(folder)), None)

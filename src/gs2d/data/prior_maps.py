@@ -7,7 +7,7 @@ median of the known values of each block; a smaller map is interpolated only whe
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from gs2d.core.camera import Camera
 from gs2d.data.arrays import read_npy
 from gs2d.data.file_names import Files
 from gs2d.data.image_files import image_size, read_grey, read_image
-from gs2d.data.undistort import Intrinsics
+from gs2d.data.undistort import Intrinsics, source_positions
 from gs2d.errors import DataError
 
 DEPTHS, NORMALS = "depths", "normals"
@@ -31,8 +31,6 @@ MAX_PROJECTED = 100_000  # points; enough to align depths
 HIDING_CELLS = 48  # cells along the longer image side for the occlusion test
 HIDDEN = 1.25  # points beyond this multiple of the nearest depth in the same or a neighbouring cell are occluded
 _ASPECT = 0.02  # relative tolerance: networks write sides that are multiples of 14 or 32
-
-LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,14 +169,11 @@ class PriorMaps:
         Intrinsics of the image file, with its lens.
     camera : Camera
         Pinhole camera of the view, at training size.
-    lens_maps : callable
-        Cached ``undistort.source_positions``.
     """
 
     files: MapFiles
     intrinsics: Intrinsics
     camera: Camera
-    lens_maps: LensMaps
 
     def depth(self) -> PriorDepth:
         """Return the depth map at the pixels of the view.
@@ -224,7 +219,7 @@ class PriorMaps:
             positions = np.stack(np.meshgrid(x, y), axis=-1)
             valid = np.ones(positions.shape[:2], dtype=bool)
         else:
-            positions, valid = self.lens_maps(smaller)
+            positions, valid = source_positions(smaller)
         # Image size at the scale of the view; fractional if downscaling cut rows.
         sides = np.array((k.width * camera.fx / k.fx, k.height * camera.fy / k.fy))
         return positions * (np.array((width, height)) / sides), valid

@@ -168,10 +168,6 @@ class View:
         return image
 
 
-def _or(value: np.ndarray | None, otherwise: np.ndarray) -> np.ndarray:
-    return otherwise if value is None else value
-
-
 @dataclass(frozen=True, eq=False)
 class PointCloud:
     """Sparse points.
@@ -268,7 +264,9 @@ class Scene:
 
         def moved(view: View, pose: np.ndarray | None) -> View:
             zoom = zooms.get(view.name)
-            return view if pose is None and zoom is None else view.at(_or(pose, view.camera.T_cam_world), zoom)
+            if pose is None and zoom is None:
+                return view
+            return view.at(view.camera.T_cam_world if pose is None else pose, zoom)
 
         train = tuple(moved(view, poses.get(view.name)) for view in self.train)
         return replace(self, train=train, test=tuple(moved(view, None) for view in self.test))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -117,6 +118,7 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
     return Intrinsics(width, height, fx, fy, cx, cy, None if lens is None or lens.is_identity else lens)
 
 
+@lru_cache(maxsize=4)  # 12 bytes per pixel; cameras are mostly shared
 def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Return the source position of each pixel of the undistorted image.
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.data.build import Capture, PosedImage
-from gs2d.data.file_names import files_ending, in_any_case
+from gs2d.data.file_names import in_any_case
 from gs2d.data.readers.capture_readers import READERS
 from gs2d.data.readers.common import parsed
 from gs2d.data.scene import PointCloud
@@ -203,3 +203,8 @@ def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np
     T[:3, :3] = R.T
     T[:3, 3] = -R.T @ M[:3, 3]
     return T
+
+
+def files_ending(folder: Path, ending: str) -> list[Path]:
+    """Return the entries of a folder with a suffix, in any letter case, sorted by name."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ending)

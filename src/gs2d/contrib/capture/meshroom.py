@@ -20,6 +20,7 @@ import numpy as np
 from gs2d.contrib.capture.camera_files import (
     FileReader,
     entries,
+    files_ending,
     points_beside,
     pose_from_camera_to_world,
     real,
@@ -31,7 +32,7 @@ from gs2d.contrib.capture.camera_files import (
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
-from gs2d.data.file_names import files_ending, in_any_case
+from gs2d.data.file_names import in_any_case
 from gs2d.data.readers.common import find_photographs, head
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics

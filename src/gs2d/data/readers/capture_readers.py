@@ -11,8 +11,6 @@ from gs2d.data.build import Capture
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 
-__all__ = ["READERS", "Reader", "register_reader"]
-
 _CORE = {"colmap": "gs2d.data.readers.colmap"}
 
 

@@ -159,11 +159,7 @@ class _ModelFile:
     def count(self, what: str, smallest: int) -> int:
         """Return the number of records that follow, each of at least ``smallest`` bytes."""
         count = int(self.unpack("Q", f"the number of {what}")[0])
-        if self.at + count * smallest > self.size:
-            raise DataError(
-                f"{self.path} is truncated or not a COLMAP file: {count} {what} need at least "
-                f"{self.at + count * smallest} bytes, got {self.size}; copy it again"
-            )
+        self.at = self.take(count * smallest, f"a list of {count} {what}")
         return count
 
     def name(self, what: str) -> str:
