@@ -50,7 +50,7 @@ def test_slabs_respect_the_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None
 
     def recorded(*arguments: object, **options: object) -> object:
         volume = fuse_blocks(*arguments, **options)  # type: ignore[arg-type]
-        held.append(volume.nbytes)
+        held.append(len(volume.keys) * block_bytes(blocks.colored))
         return volume
 
     monkeypatch.setattr("gs2d.meshing.slabs.fuse_blocks", recorded)

@@ -9,7 +9,6 @@ docs/math.md and docs/notebook/meshing.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
@@ -27,23 +26,7 @@ _CHUNK = 1 << 21  # samples per chunk
 _WIDE = 6.0  # cells; smoothing that fills gaps between points
 
 
-@dataclass(frozen=True, eq=False)
-class Agreement:
-    """Consensus colours of points, and gains of images.
-
-    Attributes
-    ----------
-    colors : ndarray [P, 3] float32
-        Consensus colours in [0, 255].
-    gains : ndarray [V, 3] float32
-        An image shows gain * consensus.
-    """
-
-    colors: np.ndarray
-    gains: np.ndarray
-
-
-def agree(samples: Sequence[np.ndarray]) -> Agreement:
+def agree(samples: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the consensus of images; replaces votes by inlier weights, in place.
 
     Parameters
@@ -51,6 +34,13 @@ def agree(samples: Sequence[np.ndarray]) -> Agreement:
     samples : sequence of ndarray [P, 4] uint8
         For each image the colours of the points and its votes. Afterwards the fourth channel is 0 if the image does not
         see the point, else the inlier weight scaled to 1 to 255.
+
+    Returns
+    -------
+    colors : ndarray [P, 3] float32
+        Consensus colours in [0, 255].
+    gains : ndarray [V, 3] float32
+        An image shows gain * consensus.
     """
     count = len(samples[0])
     gains = _gains(np.stack([table[:: -(-count // _GAIN_POINTS)] for table in samples]))
@@ -64,7 +54,7 @@ def agree(samples: Sequence[np.ndarray]) -> Agreement:
         scaled = np.where(votes > 0, np.ceil(1 + 254 * weights), 0).astype(np.uint8)
         for k, image in enumerate(samples):
             image[part, 3] = scaled[k]
-    return Agreement(colors, gains)
+    return colors, gains
 
 
 def _gains(table: np.ndarray) -> np.ndarray:

@@ -47,26 +47,16 @@ def _faces() -> list[tuple[int, int, int, int]]:
     return faces
 
 
-def _face_segments(face: tuple[int, int, int, int], case: int) -> dict[int, int]:
-    """Return directed segments of one face, from edge to edge, one around each run of inside corners."""
-    inside = [bool(case >> c & 1) for c in face]
-    crossings = []  # (edge, leaves the inside), around the face
-    for i in range(4):
-        j = (i + 1) % 4
-        if inside[i] != inside[j]:
-            crossings.append((_EDGE_OF[frozenset((face[i], face[j]))], inside[i]))
-    segments = {}
-    for k, (edge, leaves) in enumerate(crossings):
-        if leaves:  # the run that ends here started at the previous crossing
-            segments[crossings[k - 1][0]] = edge
-    return segments
-
-
 def _loops(case: int) -> list[list[int]]:
     """Return closed loops of edges. An edge is left by one of its two faces and reached by the other."""
     follow: dict[int, int] = {}
     for face in _faces():
-        follow.update(_face_segments(face, case))
+        inside = [bool(case >> c & 1) for c in face]
+        crossed = [i for i in range(4) if inside[i] != inside[(i + 1) % 4]]  # around the face
+        edges = [_EDGE_OF[frozenset((face[i], face[(i + 1) % 4]))] for i in crossed]
+        for k, i in enumerate(crossed):
+            if inside[i]:  # the run of inside corners that ends here started at the previous crossing
+                follow[edges[k - 1]] = edges[k]
     loops = []
     while follow:
         start, at = follow.popitem()
@@ -169,10 +159,10 @@ def _neighbours(volume: Volume) -> np.ndarray:
     return rows
 
 
-def _padded(values: np.ndarray, shifted: np.ndarray, fill: float) -> np.ndarray:
-    """Return blocks with the first layer of their upper neighbours [n, 9, 9, 9], ``fill`` for missing neighbours."""
+def _padded(values: np.ndarray, shifted: np.ndarray) -> np.ndarray:
+    """Return blocks with the first layer of their upper neighbours [n, 9, 9, 9], 0 for missing neighbours."""
     cubes = values.reshape(-1, BLOCK, BLOCK, BLOCK)
-    out = np.full((len(shifted), BLOCK + 1, BLOCK + 1, BLOCK + 1), fill, dtype=values.dtype)
+    out = np.zeros((len(shifted), BLOCK + 1, BLOCK + 1, BLOCK + 1), values.dtype)
     for corner, shift in enumerate(CORNERS):
         rows = shifted[:, corner]
         has = rows >= 0
@@ -184,8 +174,8 @@ def _padded(values: np.ndarray, shifted: np.ndarray, fill: float) -> np.ndarray:
 
 def _chunk_triangles(volume: Volume, shifted: np.ndarray, chunk: np.ndarray, min_weight: float) -> np.ndarray:
     """Return the triangles [T, 3] of some blocks, as global edge numbers."""
-    inside = _padded(volume.tsdf, shifted[chunk], 0.0) < 0
-    valid = _padded(volume.weight, shifted[chunk], 0.0) >= max(min_weight, 1e-12)
+    inside = _padded(volume.tsdf, shifted[chunk]) < 0
+    valid = _padded(volume.weight, shifted[chunk]) >= max(min_weight, 1e-12)
     case = np.zeros((len(chunk), BLOCK, BLOCK, BLOCK), np.uint8)
     full = np.ones_like(case, dtype=bool)
     for corner, (x, y, z) in enumerate(CORNERS):

@@ -140,31 +140,30 @@ def _sample_boxes(
     safe = np.where(ahead, local[:, 2], 1.0)
     size = camera.width * samples, camera.height * samples
     focal, center = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    met, crossing = np.arange(len(faces)), np.zeros(0, np.int64)
+    met, crossing = np.arange(len(faces)), np.zeros(0, np.int64)  # faces beyond the near plane, and across it
     if not ahead.all():
         corners = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
         met, crossing = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
+
+    def rounded(low: np.ndarray, high: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+        low, high = low * samples - 0.5, high * samples - 0.5
+        first, end = np.ceil(low - _MARGIN), np.floor(high + _MARGIN) + 1
+        return np.clip(first, 0, most).astype(np.int32), np.clip(end, 0, most).astype(np.int32)
+
     bounds: list[np.ndarray] = []
-    parts: list[np.ndarray] = []  # bounds of the faces that cross the near plane
     for axis in range(2):
-        pixels = (local[:, axis] / safe * focal[axis] + center[axis]) * samples - 0.5  # [P]
-        first = np.clip(np.ceil(pixels - _MARGIN), 0, size[axis]).astype(np.int32)
-        end = np.clip(np.floor(pixels + _MARGIN) + 1, 0, size[axis]).astype(np.int32)
+        pixels = local[:, axis] / safe * focal[axis] + center[axis]  # [P]
+        first, end = rounded(pixels, pixels, size[axis])
         a, b, c = (faces[met, k] for k in range(3))
-        low = np.minimum(np.minimum(first[a], first[b]), first[c])
-        high = np.maximum(np.maximum(end[a], end[b]), end[c])
+        cut_first, cut_end = rounded(*_reach(local[faces[crossing]], axis, focal[axis], center[axis], near), size[axis])
+        low = np.concatenate([np.minimum(np.minimum(first[a], first[b]), first[c]), cut_first])
+        high = np.concatenate([np.maximum(np.maximum(end[a], end[b]), end[c]), cut_end])
         some = high > low
-        met, bounds = met[some], [*(bound[some] for bound in bounds), low[some], high[some]]
-    for axis in range(2):
-        low, high = _reach(local[faces[crossing]], axis, focal[axis], center[axis], near)
-        first = np.clip(np.ceil(low * samples - 0.5 - _MARGIN), 0, size[axis]).astype(np.int32)
-        end = np.clip(np.floor(high * samples - 0.5 + _MARGIN) + 1, 0, size[axis]).astype(np.int32)
-        some = end > first
-        crossing = crossing[some]
-        parts = [bound[some] for bound in parts] + [first[some], end[some]]
+        met, crossing = met[some[: len(met)]], crossing[some[len(met) :]]
+        bounds = [*(bound[some] for bound in bounds), low[some], high[some]]
     every = np.concatenate([met, crossing])
     order = np.argsort(every, kind="stable")
-    x0, x1, y0, y1 = (np.concatenate([bound, part])[order] for bound, part in zip(bounds, parts, strict=True))
+    x0, x1, y0, y1 = (bound[order] for bound in bounds)
     return every[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
 
 

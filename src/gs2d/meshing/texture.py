@@ -110,8 +110,6 @@ def required(module: str) -> Any:
 
 def simplified(mesh: Mesh, faces: int) -> Mesh:
     """Simplify to at most ``faces`` triangles by quadric edge collapse; a simplified mesh has no vertex colours."""
-    if faces < 4:
-        raise ProtocolError(f"faces must be an integer >= 4, got {faces}")
     return mesh if len(mesh.faces) <= faces else simplify(Mesh(mesh.vertices, mesh.faces), faces=faces)
 
 
@@ -266,10 +264,8 @@ def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, thr
     Raises
     ------
     ProtocolError
-        If the size is out of range, or no image sees the surface.
+        If no image sees the surface.
     """
-    if not MIN_SIZE <= size <= MAX_SIZE:
-        raise ProtocolError(f"texture_size must be {MIN_SIZE} to {MAX_SIZE} texels, got {size}")
     texels = texels_of(atlas, size)
     colors, seen = surface_colors(atlas.mesh, texels, images, best=best, threads=threads)
     fill_unseen(atlas, texels, colors, seen)
@@ -308,13 +304,12 @@ def surface_colors(
     points = _Points.of(mesh, texels, origin)
     coarse = (_Looked(mesh, image, origin) for image in images(COARSE))
     common, samples = _compared(points, texels, float(areas(mesh).sum()), coarse)
-    agreement = agree(samples)
+    consensus, gains = agree(samples)
     chooser = _Chooser(points, best, threads or os.cpu_count() or 1)
     for number, image in enumerate(images(1)):
         looked = _Looked(mesh, image, origin)
         rows = np.flatnonzero(samples[number][:, 3])
-        gain = agreement.gains[number]
-        looked.correct(common.positions[rows], samples[number][rows], agreement.colors[rows], gain)
+        looked.correct(common.positions[rows], samples[number][rows], consensus[rows], gains[number])
         chooser.add(looked)
     colors, seen = chooser.colors()
     if not seen.any():
@@ -478,14 +473,12 @@ def _shown(source: ColorSource, small: Camera) -> np.ndarray:
     """Return which pixels [H, W] of the downscaled camera may be used."""
     image, valid = source.image, source.valid
     height, width = image.shape[:2]
+    shown = np.ones((height, width), bool) if valid is None else valid
+    if image.shape[2] == 4:
+        shown = shown & (image[..., 3] >= 128)
     row = ((np.arange(small.height) + 0.5) * height / small.height).astype(np.int64)[:, None]
     column = ((np.arange(small.width) + 0.5) * width / small.width).astype(np.int64)[None]
-    shown = np.ones((small.height, small.width), bool)
-    if image.shape[2] == 4:
-        shown &= image[row, column, 3] >= 128
-    if valid is not None:
-        shown &= valid[row, column]
-    return shown
+    return np.asarray(shown[row, column])
 
 
 def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:

@@ -63,12 +63,6 @@ class Volume:
         """Block coordinates [M, 3] int64."""
         return np.stack(np.unravel_index(self.keys, self.dims), axis=1)
 
-    @property
-    def nbytes(self) -> int:
-        """Size of all arrays in bytes."""
-        arrays = (self.keys, self.tsdf, self.weight, self.color, self.color_weight)
-        return sum(a.nbytes for a in arrays if a is not None)
-
 
 def block_bytes(colored: bool) -> int:
     """Return the size of one block of a volume in bytes."""
@@ -167,28 +161,22 @@ def fusion_backend(backend: str | Backend) -> Backend:
     return get_backend("cpu") if chosen.fusion() is None else chosen
 
 
-class _Grid:
-    """The blocks of a volume."""
+def _changed(volume: Volume, view: DepthSampler) -> dict[str, np.ndarray | None]:
+    """Project the blocks that a view may change into it, by kernel argument.
 
-    def __init__(self, volume: Volume) -> None:
-        self.volume, voxel = volume, volume.limits.voxel
-        self._origins = np.asarray(volume.limits.lower) + volume.blocks * (BLOCK * voxel)  # [M, 3] of first voxels
-        self._local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1) * voxel  # [512, 3] from there
-
-    def change(self, view: DepthSampler) -> dict[str, np.ndarray | None]:
-        """Project the blocks that a view may change into it, by kernel argument.
-
-        ``rows`` [n] int64 are these blocks, ``bases`` [n, 3] float32 (x z, y z, z) of their first voxels, ``offsets``
-        [3, 512] float32 of a voxel from there.
-        """
-        limits = self.volume.limits
-        size = BLOCK * limits.voxel
-        radius = 0.5 * np.sqrt(3.0) * size
-        rows = block_visibility(view, self._origins + 0.5 * (size - limits.voxel), radius, limits.truncation)
-        rotation, shift = view.projection[:, :3].T, view.projection[:, 3]
-        offsets = np.ascontiguousarray((self._local @ rotation).T, dtype=np.float32)
-        bases = (self._origins[rows] @ rotation + shift).astype(np.float32)
-        return {"rows": rows, "bases": bases, "offsets": offsets}
+    ``rows`` [n] int64 are these blocks, ``bases`` [n, 3] float32 (x z, y z, z) of their first voxels, ``offsets``
+    [3, 512] float32 of a voxel from there.
+    """
+    limits, voxel = volume.limits, volume.limits.voxel
+    origins = np.asarray(limits.lower) + volume.blocks * (BLOCK * voxel)  # [M, 3] of first voxels
+    local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1) * voxel  # [512, 3] from there
+    size = BLOCK * voxel
+    radius = 0.5 * np.sqrt(3.0) * size
+    rows = block_visibility(view, origins + 0.5 * (size - voxel), radius, limits.truncation)
+    rotation, shift = view.projection[:, :3].T, view.projection[:, 3]
+    offsets = np.ascontiguousarray((local @ rotation).T, dtype=np.float32)
+    bases = (origins[rows] @ rotation + shift).astype(np.float32)
+    return {"rows": rows, "bases": bases, "offsets": offsets}
 
 
 @contextmanager
@@ -208,15 +196,15 @@ def integrator(volumes: Sequence[Volume], device: FusionOnDevice | None) -> Iter
             return arrays
         return {name: None if a is None else torch.from_numpy(a).to(device.device) for name, a in arrays.items()}
 
-    grids = [_Grid(volume) for volume in volumes if len(volume.keys)]
-    held = [placed(_volume_arrays(grid.volume)) for grid in grids]
-    colored = any(grid.volume.color is not None for grid in grids)
+    volumes = [volume for volume in volumes if len(volume.keys)]
+    held = [placed(_volume_arrays(volume)) for volume in volumes]
+    colored = any(volume.color is not None for volume in volumes)
 
     def add(view: DepthSampler) -> None:
         image = placed(_view_arrays(view, colored=colored))
-        for grid, volume in zip(grids, held, strict=True):
-            arrays = image | placed(grid.change(view)) | volume
-            arguments = arguments_of((view.height, view.width), grid.volume.limits.truncation, arrays)
+        for volume, tensors in zip(volumes, held, strict=True):
+            arrays = image | placed(_changed(volume, view)) | tensors
+            arguments = arguments_of((view.height, view.width), volume.limits.truncation, arrays)
             if device is None:
                 fuse_on_cpu(load(), arguments)
             else:
@@ -224,8 +212,8 @@ def integrator(volumes: Sequence[Volume], device: FusionOnDevice | None) -> Iter
 
     yield add
     if device is not None:
-        for grid, tensors in zip(grids, held, strict=True):
-            for name, array in _volume_arrays(grid.volume).items():
+        for volume, tensors in zip(volumes, held, strict=True):
+            for name, array in _volume_arrays(volume).items():
                 if array is not None:
                     array[...] = tensors[name].cpu().numpy()
 
@@ -293,17 +281,28 @@ def find_blocks(
     """
     check_truncation(limits)
     dims = block_grid(limits)
-    budget = Budget(limits, max_bytes)
-    keys = np.zeros(0, dtype=np.int64)
+    (keys,), colored = gather_keys(frames, lambda item: [touched_blocks(item, limits, dims)], Budget(limits, max_bytes))
+    return VolumeBlocks(dims, keys, colored)
+
+
+def gather_keys(
+    frames: Iterable[DepthMap], touched: Callable[[DepthMap], list[np.ndarray]], budget: Budget
+) -> tuple[list[np.ndarray], bool]:
+    """Return the keys of the blocks near the surfaces of depth maps, and whether any has colour.
+
+    ``touched`` returns those of one depth map, in one array for each level of the volume.
+    """
+    keys: list[np.ndarray] = []
     colored = False
     for item in frames:
         colored = colored or item.color is not None
-        keys = merged(keys, touched_blocks(item, limits, dims))
-        budget.check(len(keys), colored, partial=True)
-    budget.check(len(keys), colored, partial=False)
-    if not len(keys):
+        found = touched(item)
+        keys = [merged(*pair) for pair in zip(keys or found, found, strict=True)]
+        budget.check(sum(map(len, keys)), colored, partial=True)
+    budget.check(sum(map(len, keys)), colored, partial=False)
+    if not any(map(len, keys)):
         raise ProtocolError("no depth is inside the limits of the fusion; increase bbox or depth_limit")
-    return VolumeBlocks(dims, keys, colored)
+    return keys, colored
 
 
 def fuse_blocks(
@@ -341,13 +340,6 @@ def box_corners(volume: Volume) -> np.ndarray:
     return np.array([[box[c >> axis & 1, axis] for axis in range(3)] for c in range(8)])
 
 
-def _samples(item: DepthMap, depth: np.ndarray, limits: FusionBounds) -> tuple[int, int]:
-    """Return the number of samples along a side of each pixel, and along each ray."""
-    half = 0.5 * BLOCK * limits.voxel
-    width = float(depth.max(initial=0.0)) / min(item.camera.fx, item.camera.fy)
-    return max(1, int(np.ceil(width / half))), int(np.ceil(2 * limits.truncation / half)) + 1
-
-
 def touched_blocks(item: DepthMap, limits: FusionBounds, dims: tuple[int, int, int]) -> np.ndarray:
     """Return the sorted keys [K] of the blocks near the surface of one depth map.
 
@@ -360,7 +352,8 @@ def touched_blocks(item: DepthMap, limits: FusionBounds, dims: tuple[int, int, i
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
     depth = item.depth[rows, columns].astype(np.float64)
-    parts, steps = _samples(item, depth, limits)
+    width = float(depth.max(initial=0.0)) / min(item.camera.fx, item.camera.fy)  # of the farthest pixel
+    parts, steps = max(1, int(np.ceil(width / half))), int(np.ceil(2 * limits.truncation / half)) + 1
     shifts = (np.arange(parts) + 0.5) / parts - 0.5
     offsets = np.linspace(-limits.truncation, limits.truncation, steps)
     # The lower of the two nearest blocks along each axis; the grid has a border of one block.

@@ -56,8 +56,8 @@ from gs2d.meshing.tsdf_volume import (
     block_grid,
     check_truncation,
     fusion_backend,
+    gather_keys,
     invalid_volume,
-    merged,
     touched_blocks,
 )
 from gs2d.render.backends import Backend
@@ -219,16 +219,7 @@ def find_cascade_blocks(
     check_truncation(cascade.levels[0])
     block_grid(cascade.levels[0])  # refuses voxels that are too small
     budget = Budget(cascade.levels[0], max_bytes, side=2 * cascade.half, step=STEP)
-    keys = [np.zeros(0, dtype=np.int64) for _ in cascade.levels]
-    colored = False
-    for item in frames:
-        colored = colored or item.color is not None
-        for k, found in enumerate(_touched(item, cascade)):
-            keys[k] = merged(keys[k], found)
-        budget.check(sum(map(len, keys)), colored, partial=True)
-    budget.check(sum(map(len, keys)), colored, partial=False)
-    if not any(map(len, keys)):
-        raise ProtocolError("no depth is inside the limits of the fusion; increase bbox or depth_limit")
+    keys, colored = gather_keys(frames, lambda item: _touched(item, cascade), budget)
     return tuple(VolumeBlocks(cascade.dims, found, colored) for found in keys)
 
 
