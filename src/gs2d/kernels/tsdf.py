@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.cuda.kernel_arguments import THREADS, structure
 
 if TYPE_CHECKING:
     import torch
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from gs2d.kernels.library import Library
 
 __all__ = [
-    "FuseArguments",
     "FusionOnDevice",
     "arguments_of",
     "fuse_on_cpu",
@@ -30,7 +30,6 @@ __all__ = [
 ]
 
 VOXELS = 512  # per block
-THREADS = 128  # per CUDA block, fuse.cu
 
 
 @dataclass(frozen=True)
@@ -39,32 +38,6 @@ class FusionOnDevice:
 
     launcher: Launcher
     device: torch.device
-
-
-class FuseArguments(ctypes.Structure):
-    """``FuseArguments`` of core/fuse.h, with float32 arrays."""
-
-    _fields_ = (
-        ("blocks", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("rows", "bases", "offsets")),
-        *((name, ctypes.c_int64) for name in ("width", "height")),
-        *((name, ctypes.c_void_p) for name in ("depth", "slope_x", "slope_y", "pixel_weight", "pixel_color")),
-        ("truncation", ctypes.c_float),
-        *((name, ctypes.c_void_p) for name in ("tsdf", "weight", "color", "color_weight")),
-    )
-
-
-class MarkArguments(ctypes.Structure):
-    """``MarkArguments`` of core/fuse.h."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        ("steps", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("rays", "depth", "offsets")),
-        *((name, ctypes.c_double * 3) for name in ("start", "end")),
-        ("padded", ctypes.c_int64 * 3),
-        ("marks", ctypes.c_void_p),
-    )
 
 
 def mark_on_cpu(
@@ -95,7 +68,7 @@ def mark_on_cpu(
         Includes a border of one block on all sides; changed in place.
     """
     rays, depth, offsets = (np.ascontiguousarray(a, np.float64) for a in (rays, depth, offsets))
-    arguments = MarkArguments(
+    arguments = structure("MarkArguments")(
         count=len(depth),
         steps=len(offsets),
         rays=rays.ctypes.data,
@@ -111,7 +84,7 @@ def mark_on_cpu(
 
 def arguments_of(
     size: tuple[int, int], truncation: float, arrays: dict[str, np.ndarray | None] | dict[str, Tensor | None]
-) -> FuseArguments:
+) -> ctypes.Structure:
     """Return the arguments for a depth map of ``size`` (height, width).
 
     ``arrays`` has the names of the fields. The arrays must be contiguous float32 (``rows``: int64) and outlive the
@@ -119,7 +92,7 @@ def arguments_of(
     """
     rows = arrays["rows"]
     assert rows is not None
-    arguments = FuseArguments(blocks=len(rows), height=size[0], width=size[1], truncation=truncation)
+    arguments = structure("FuseArguments")(blocks=len(rows), height=size[0], width=size[1], truncation=truncation)
     for name, array in arrays.items():
         if array is None:
             continue
@@ -134,7 +107,7 @@ def arguments_of(
     return arguments
 
 
-def fuse_on_cpu(library: Library, arguments: FuseArguments) -> None:
+def fuse_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
     """Fuse the depth map, with the library's number of threads.
 
     Raises
@@ -149,6 +122,6 @@ def fuse_on_cpu(library: Library, arguments: FuseArguments) -> None:
     library.function("gs2d_fuse", None, [ctypes.c_void_p])(ctypes.byref(arguments))
 
 
-def fuse_on_gpu(launcher: Launcher, arguments: FuseArguments) -> None:
+def fuse_on_gpu(launcher: Launcher, arguments: ctypes.Structure) -> None:
     """Fuse the depth map: one launch on the current stream."""
     launcher.launch("fuse_voxels", arguments.blocks * (VOXELS // THREADS), THREADS, arguments)

@@ -6,6 +6,7 @@ allocates the memory. The host waits for the device only for the number of pairs
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,16 +18,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, IMAGES
 from gs2d.errors import BackendError
-from gs2d.kernels.cuda.kernel_arguments import (
-    DepthArguments,
-    ErrorArguments,
-    FeatureArguments,
-    FeatureBuffers,
-    KernelView,
-    OccludedArguments,
-    SlotArguments,
-    fill,
-)
+from gs2d.kernels.cuda.kernel_arguments import fill, structure, work_of
 from gs2d.kernels.cuda.launch import Launcher, Work
 from gs2d.render.cuda_works import (
     blend,
@@ -41,7 +33,6 @@ from gs2d.render.cuda_works import (
     see,
     splat_gradients,
     takes_view,
-    work_of,
 )
 from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, Rendering, room_for
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
@@ -64,7 +55,6 @@ CHANNELS = 8  # pixels.h: further channels are padded to a multiple of this
 MAX_SPLATS = 1 << 24  # an entry stores the splat in 24 bits
 MAX_SLOTTED = 1 << 30  # four slots each, indexed with 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
-CAMERA_BYTES = KernelView.near.offset  # pose and intrinsics, which identify a view of a training
 DEPTH = ("depth_transmittance", "slope")  # empty unless that depth was requested
 LISTS = ("records", "entries", "ranges", "tiles", "seen")
 PROJECTED = {
@@ -84,7 +74,7 @@ class ForwardState:
 
     Attributes
     ----------
-    view : KernelView
+    view : structure "View"
     records : Tensor [N, 16] float32
         Screen records; undefined for splats without tiles.
     tile_counts : Tensor [N] int32
@@ -110,7 +100,7 @@ class ForwardState:
         Index of each entry's pair before the sort by tile.
     """
 
-    view: KernelView
+    view: ctypes.Structure
     records: Tensor
     tile_counts: Tensor
     entries: Tensor
@@ -130,21 +120,21 @@ class ForwardState:
         return {name: getattr(self, name) for name in LISTS}
 
 
-def view_of(camera: Camera, settings: RasterSettings) -> KernelView:
+def view_of(camera: Camera, settings: RasterSettings) -> ctypes.Structure:
     """Return the view structure of the kernels; BackendError for a setting that only the reference backend supports."""
     if settings.lowpass_depth != "center":
         raise BackendError(
             f"the cuda backend needs lowpass_depth 'center', got {settings.lowpass_depth!r}; use --backend reference"
         )
-    view = KernelView()
-    view.R[:] = np.asarray(camera.rotation).ravel().tolist()
-    view.t[:] = np.asarray(camera.T_cam_world[:3, 3]).tolist()
-    view.center[:] = np.asarray(camera.center).tolist()
+    view = structure("View")()
+    view.camera.R[:] = np.asarray(camera.rotation).ravel().tolist()
+    view.camera.t[:] = np.asarray(camera.T_cam_world[:3, 3]).tolist()
+    view.camera.center[:] = np.asarray(camera.center).tolist()
     view.background[:] = [float(c) for c in settings.background]
-    for name in ("fx", "fy", "cx", "cy", "width", "height"):
-        setattr(view, name, getattr(camera, name))
-    for name in ("near", "mip_px", "alpha_max", "transmittance_min", "sh_degree"):
-        setattr(view, name, getattr(settings, name))
+    fill(view.camera, **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")})
+    view.width, view.height = camera.width, camera.height
+    constants = ("near", "mip_px", "alpha_max", "transmittance_min", "sh_degree")
+    fill(view, **{name: getattr(settings, name) for name in constants})
     view.lowpass_px, view.inv_lowpass2 = settings.clamp_px, 1 / settings.clamp_px**2
     view.log2_alpha_min = math.log2(settings.alpha_min)
     view.error_k2, view.near_plane_policy = (
@@ -157,7 +147,7 @@ def view_of(camera: Camera, settings: RasterSettings) -> KernelView:
     return view
 
 
-def _run(launcher: Launcher, view: KernelView, work: Work) -> None:
+def _run(launcher: Launcher, view: ctypes.Structure, work: Work) -> None:
     """Run a launch for a view."""
     if takes_view(work):
         see([work], view)
@@ -169,7 +159,7 @@ def _named(parameters: Sequence[Tensor]) -> dict[str, Tensor]:
 
 
 def _project(
-    launcher: Launcher, view: KernelView, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
+    launcher: Launcher, view: ctypes.Structure, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
 ) -> dict[str, Tensor]:
     """Return the outputs of project.cu; records, cull and rects of splats without tiles are undefined."""
     count, device = parameters[0].shape[0], parameters[0].device
@@ -186,7 +176,7 @@ def _project(
 
 def forward(
     launcher: Launcher,
-    view: KernelView,
+    view: ctypes.Structure,
     parameters: Sequence[Tensor],
     *,
     exact: bool = True,
@@ -224,16 +214,16 @@ def forward(
     if transmittance:
         more = {"alpha": images["alpha"], "median": images["depth_median"], "slope": images["slope"]}
         more |= {"depth": images["depth_transmittance"]}
-        _run(launcher, view, work_of("transmittance_depth", tiles, DepthArguments(), lists, more))
+        _run(launcher, view, work_of("transmittance_depth", tiles, lists, more))
     kept = {name: projected[name] for name in ("tile_counts", "radii")}
     return ForwardState(view=view, images=images, **found, **kept)
 
 
 def _features(
     values: Tensor, background: Tensor, images: Tensor, upstream: Tensor | None = None, gradients: Tensor | None = None
-) -> FeatureBuffers:
+) -> ctypes.Structure:
     """Return the structure of further channels; their number is a multiple of ``CHANNELS``, tensors are contiguous."""
-    features = FeatureBuffers(count=values.shape[1])
+    features = structure("Features")(count=values.shape[1])
     fill(features, values=values, background=background, images=images, upstream=upstream, gradients=gradients)
     return features
 
@@ -242,15 +232,15 @@ def blend_features(launcher: Launcher, frame: ForwardState, values: Tensor, back
     """Return the images [F, H, W] of further channels [N, F] over a background [F], for the view of ``frame``."""
     final_T = frame.images["final_T"]
     images = final_T.new_empty(values.shape[1], *final_T.shape)
-    arguments = FeatureArguments(features=_features(values, background, images))
-    work = work_of("features_forward", len(frame.tiles), arguments, frame.lists, {"final_T": final_T})
+    features = _features(values, background, images)
+    work = work_of("features_forward", len(frame.tiles), frame.lists, final_T=final_T, features=features)
     _run(launcher, frame.view, work)
     return images
 
 
 def _bin(
     launcher: Launcher,
-    view: KernelView,
+    view: ctypes.Structure,
     projected: dict[str, Tensor],
     exact: bool,
     budget: PairBudget | None = None,
@@ -262,8 +252,8 @@ def _bin(
     tiles = int(view.tiles_x) * int(view.tiles_y)
     order = torch.sort(projected["depth_keys"], stable=True).indices
     ends = torch.cumsum(projected["tile_counts"][order], 0, dtype=torch.int64)
-    camera = bytes(view)[:CAMERA_BYTES]
-    candidates = room_for(ends[-1], Rendering(tiles, len(order), camera), budget) if len(ends) else 0
+    rendering = Rendering(tiles, len(order), bytes(view.camera))
+    candidates = room_for(ends[-1], rendering, budget) if len(ends) else 0
     if candidates > MAX_PAIRS:
         raise BackendError(
             f"{candidates} pairs of splat and tile, expected fewer than 2^31: use fewer splats or pixels"
@@ -391,18 +381,18 @@ class _Sums:
         extras = self.extras.new_empty(count, 4)
         gradients = None if self.gradients is None else self.gradients.new_empty(count, self.gradients.shape[1])
         given = {"order": self.frame.order, "ends": self.frame.ends, "gradients": gradients, "extras": extras}
-        arguments = SlotArguments(count=count, candidates=len(self.slots))
+        sizes = {"count": count, "candidates": len(self.slots)}
         slots = {"slots": self.gradients, "extra_slots": self.extras}
         if self._features is not None:
             slots["feature_slots"], given["features"] = self._features
-            arguments.channels = self._features[1].shape[1]
-        _run(launcher, self.frame.view, work_of("sum_slots", blocks_of(32 * count), arguments, given, slots))
+            sizes["channels"] = self._features[1].shape[1]
+        _run(launcher, self.frame.view, work_of("sum_slots", blocks_of(32 * count), sizes, given, slots))
         return gradients, extras
 
 
 def errors(
     launcher: Launcher,
-    view: KernelView,
+    view: ctypes.Structure,
     parameters: Sequence[Tensor],
     image: Tensor,
     mask: Tensor | None,
@@ -419,9 +409,9 @@ def errors(
         units = torch.zeros(count, dtype=torch.int64, device=image.device)
         given |= {name: lists[name] for name in ("entries", "ranges", "tiles")}
         given |= {"records": projected["records"], "errors": units}
-        _run(launcher, view, work_of("splat_errors_occluded", len(lists["tiles"]), OccludedArguments(), given))
+        _run(launcher, view, work_of("splat_errors_occluded", len(lists["tiles"]), given))
         return (units.to(torch.float64) * ERROR_UNIT).to(torch.float32)
     total = torch.empty(count, dtype=torch.float32, device=image.device)
     given |= {name: projected[name] for name in ("records", "cull", "rects", "tile_counts")} | {"errors": total}
-    _run(launcher, view, work_of("splat_errors", blocks_of(32 * count), ErrorArguments(count=count), given))
+    _run(launcher, view, work_of("splat_errors", blocks_of(32 * count), given, count=count))
     return total

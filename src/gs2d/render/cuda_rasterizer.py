@@ -6,6 +6,7 @@ the launcher of the tests runs the same sources on the CPU. Memory, sorts and th
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -17,7 +18,6 @@ from torch.nn.functional import pad
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
 from gs2d.errors import ShapeError
-from gs2d.kernels.cuda.kernel_arguments import KernelView
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.cuda_passes import (
     CHANNELS,
@@ -75,7 +75,7 @@ class _CudaOptions:
     """Arguments of _CudaRasterize without gradients."""
 
     launcher: Launcher
-    view: KernelView
+    view: ctypes.Structure
     exact_masks: bool
     distortion: bool
     transmittance: bool

@@ -8,15 +8,17 @@ written. The launches are therefore always the same, and a launcher may run them
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.kernels.cuda import kernel_arguments as structures
 from gs2d.kernels.cuda.cuda_losses import MEAN_PIXELS, NORMAL_H, NORMAL_W, strips
+from gs2d.kernels.cuda.kernel_arguments import fill, work_of
 from gs2d.kernels.cuda.launch import Launcher, Work
 from gs2d.kernels.cuda.sort import (
     DIGITS,
@@ -29,9 +31,8 @@ from gs2d.kernels.cuda.sort import (
     pieces_of,
 )
 from gs2d.kernels.native_adam import bias_corrections
-from gs2d.render.cuda_passes import CAMERA_BYTES, MAX_SPLATS, PROJECTED, view_of
+from gs2d.render.cuda_passes import MAX_SPLATS, PROJECTED, view_of
 from gs2d.render.cuda_works import (
-    THREADS,
     blend,
     blend_gradients,
     blocks_of,
@@ -107,7 +108,7 @@ class Stepper:
         self._arena = Arena(device)
         self._plans: dict[tuple[object, ...], _Plan] = {}
         self._generation = -1
-        self._views: dict[tuple[int, int], tuple[object, object, structures.KernelView, bytes]] = {}
+        self._views: dict[tuple[int, int], tuple[object, object, ctypes.Structure]] = {}
 
     def release(self) -> None:
         """Free the memory, since a rendering outside of whole steps needs as much."""
@@ -123,8 +124,8 @@ class Stepper:
         count = len(step.splats)
         if not 0 < count < MAX_SPLATS or budget.overflow is not None or not _suits(step):
             return False
-        view, camera = self._view_of(step)
-        rendering = Rendering(int(view.tiles_x) * int(view.tiles_y), count, camera)
+        view = self._view_of(step)
+        rendering = Rendering(int(view.tiles_x) * int(view.tiles_y), count, bytes(view.camera))
         room = budget.room(rendering)
         if room is None or room > MOST_SORTED:
             return False
@@ -136,19 +137,18 @@ class Stepper:
         self._launcher.run(plan.afterwards)
         return True
 
-    def _view_of(self, step: WholeStep) -> tuple[structures.KernelView, bytes]:
-        """Return the structure of a camera and its key; cached, since cameras recur."""
+    def _view_of(self, step: WholeStep) -> ctypes.Structure:
+        """Return the structure of a camera; cached, since cameras recur."""
         key = id(step.camera), id(step.settings)
         known = self._views.get(key)
         if known is None:
             if len(self._views) >= MOST_VIEWS:
                 self._views.clear()
-            view = view_of(step.camera, step.settings)
             # Keep the objects, so that their ids stay valid.
-            known = self._views[key] = step.camera, step.settings, view, bytes(view)[:CAMERA_BYTES]
-        return known[2], known[3]
+            known = self._views[key] = step.camera, step.settings, view_of(step.camera, step.settings)
+        return known[2]
 
-    def _plan_of(self, step: WholeStep, view: structures.KernelView, room: int) -> _Plan:
+    def _plan_of(self, step: WholeStep, view: ctypes.Structure, room: int) -> _Plan:
         """Return the launches of such an iteration, with all constant arguments filled."""
         key = _key(step)
         plan = self._plans.get(key)
@@ -254,7 +254,7 @@ class _Sorting:
 
     def clear(self) -> Work:
         """Clear the scratch memory."""
-        self._clearing = Work("clear_words", 1, SORT_THREADS, structures.ClearArguments(words=self.part("tickets")))
+        self._clearing = work_of("clear_words", 1, threads=SORT_THREADS, words=self.part("tickets"))
         return self._clearing
 
     def by_depth(self, depth_keys: Tensor) -> list[Work]:
@@ -262,14 +262,14 @@ class _Sorting:
         n, arena = self._count, self._arena
         keys = [depth_keys, arena.get("more_depth_keys", n, torch.int32)]
         orders = [arena.get("order", n, torch.int32), arena.get("more_order", n, torch.int32)]
-        counting = structures.DigitArguments(count=n, passes=MOST_PASSES, digits=self.part("depth_digits"))
-        structures.fill(counting, keys=keys[0])
-        works, plan = [Work("count_digits_32", digit_blocks(n), SORT_THREADS, counting)], passes_of(DEPTH_BITS)
+        counting = {"count": n, "passes": MOST_PASSES, "keys": keys[0], "digits": self.part("depth_digits")}
+        works = [work_of("count_digits_32", digit_blocks(n), counting, threads=SORT_THREADS)]
+        plan = passes_of(DEPTH_BITS)
         for number, (shift, bits) in enumerate(plan):
             source, target = number % 2, (number + 1) % 2
-            arguments = structures.SortArguments(count=n, shift=shift, bits=bits)
-            structures.fill(
-                arguments,
+            one = work_of("sort_pass_32", pieces_of(n), threads=SORT_THREADS, count=n, shift=shift, bits=bits)
+            fill(
+                one.arguments,
                 keys=keys[source],
                 payloads=None if number == 0 else orders[source],
                 sorted_keys=None if number == len(plan) - 1 else keys[target],
@@ -278,31 +278,31 @@ class _Sorting:
                 ticket=self.part("tickets", number),
                 words=self.part("depth_words", number * pieces_of(n) * DIGITS),
             )
-            works.append(Work("sort_pass_32", pieces_of(n), SORT_THREADS, arguments))
+            works.append(one)
         self.order = orders[len(plan) % 2]
         return works
 
     def running(self, tile_counts: Tensor, overflow: Tensor) -> Work:
         """Compute the running sums of pairs in depth order, their total, and whether it exceeds the room."""
-        self._counting = structures.RunningArguments(count=self._count)
-        structures.fill(self._counting, order=self.order, tile_counts=tile_counts, ends=self.ends, overflow=overflow)
-        structures.fill(self._counting, ticket=self.part("tickets", 2 * MOST_PASSES), words=self.part("running"))
-        return Work("running_counts", pieces_of(self._count), SORT_THREADS, self._counting)
+        given = {"order": self.order, "tile_counts": tile_counts, "ends": self.ends, "overflow": overflow}
+        scratch = {"ticket": self.part("tickets", 2 * MOST_PASSES), "words": self.part("running")}
+        blocks = pieces_of(self._count)
+        self._running = work_of("running_counts", blocks, given, scratch, threads=SORT_THREADS, count=self._count)
+        return self._running
 
     def by_tile(self) -> list[Work]:
         """Sort pairs by tile."""
         keys, payloads = self._keys, self._payloads
-        counting = structures.DigitArguments(passes=len(self._passes), digits=self.part("tile_digits"))
-        structures.fill(counting, keys=keys[0])
-        self._by_tile = [Work(f"count_digits_{self.bits}", 1, SORT_THREADS, counting)]
+        counting = {"passes": len(self._passes), "keys": keys[0], "digits": self.part("tile_digits")}
+        self._by_tile = [work_of(f"count_digits_{self.bits}", 1, counting, threads=SORT_THREADS)]
         for number, (shift, bits) in enumerate(self._passes):
             source, target = number % 2, (number + 1) % 2
-            arguments = structures.SortArguments(shift=shift, bits=bits)
-            structures.fill(arguments, keys=keys[source], payloads=payloads[source])
-            structures.fill(arguments, sorted_keys=keys[target], sorted_payloads=payloads[target])
-            arguments.digits = self.part("tile_digits", number * DIGITS)
-            arguments.ticket = self.part("tickets", MOST_PASSES + number)
-            self._by_tile.append(Work(f"sort_pass_{self.bits}", 1, SORT_THREADS, arguments))
+            one = work_of(f"sort_pass_{self.bits}", 1, threads=SORT_THREADS, shift=shift, bits=bits)
+            fill(one.arguments, keys=keys[source], payloads=payloads[source])
+            fill(one.arguments, sorted_keys=keys[target], sorted_payloads=payloads[target])
+            one.arguments.digits = self.part("tile_digits", number * DIGITS)
+            one.arguments.ticket = self.part("tickets", MOST_PASSES + number)
+            self._by_tile.append(one)
         return self._by_tile
 
     def set(self, room: int, pairs: Tensor) -> None:
@@ -310,7 +310,7 @@ class _Sorting:
         pieces = pieces_of(room)
         words = self._parts["tile_words"] + len(self._passes) * pieces * DIGITS
         self._clearing.arguments.count, self._clearing.blocks = words // 4, clear_blocks(words // 4)
-        self._counting.room, self._counting.pairs = room, pairs.data_ptr()
+        fill(self._running.arguments, room=room, pairs=pairs)
         first, *passes = self._by_tile
         first.arguments.count, first.blocks = room, digit_blocks(room)
         for number, work in enumerate(passes):
@@ -332,44 +332,43 @@ class _Losses:
 
     def __init__(self, step: WholeStep, images: Mapping[str, Tensor], upstream: Mapping[str, Tensor]) -> None:
         height, width, channels = step.photograph.shape
-        kind, blocks = "rgb" if channels == 3 else "rgba", strips(height, width)
-        first = structures.PhotometricArguments(height, width)
-        second = structures.PhotometricVjpArguments(height, width)
-        for one in (first, second):
-            structures.fill(one, rendered=images["color"], maps=images["maps"])
+        kind, blocks, size = (
+            "rgb" if channels == 3 else "rgba",
+            strips(height, width),
+            {"height": height, "width": width},
+        )
+        compared = {"rendered": images["color"], "maps": images["maps"]}
+        first = work_of(f"photometric_forward_{kind}", blocks, size, compared)
+        second = work_of(f"photometric_vjp_{kind}", blocks, size, compared, gradient=images["g_color"])
+        self._comparing = first.arguments, second.arguments
+        for one in self._comparing:
             one.photograph.background[:] = step.background
-        structures.fill(second, gradient=images["g_color"])
-        self._comparing = first, second
-        self.works = [
-            Work(f"photometric_forward_{kind}", blocks, THREADS, first),
-            Work(f"photometric_vjp_{kind}", blocks, THREADS, second),
-        ]
-        self._normals: structures.NormalArguments | None = None
+        self.works = [first, second]
+        self._normals = self._smooth = self._silhouette = None
         wanted = step.losses.normals
         if wanted is not None and "normal" in upstream:
             depth = f"depth_{wanted.depth}"
-            normals = structures.NormalArguments(height=height, width=width, at_camera=int(wanted.at_camera))
-            structures.fill(normals, normal=images["normal"], depth=images[depth], alpha=images["alpha"])
-            structures.fill(normals, g_normal=upstream["normal"], g_depth=upstream[depth])
+            given = {"normal": images["normal"], "depth": images[depth], "alpha": images["alpha"]}
+            given |= {"g_normal": upstream["normal"], "g_depth": upstream[depth]}
             if wanted.of_object and channels == 3:
-                structures.fill(normals, weights=images["alpha"])
+                given["weights"] = images["alpha"]
             tiles = -(-width // NORMAL_W) * -(-height // NORMAL_H)
-            self.works.append(Work("normal_consistency_vjp", tiles, THREADS, normals))
-            self._normals = normals
-        self._smooth: structures.SmoothArguments | None = None
+            at_camera = int(wanted.at_camera)
+            self._normals = self._add("normal_consistency_vjp", tiles, given, size, at_camera=at_camera)
         if step.losses.smooth_normals and "normal" in upstream:
-            smooth = structures.SmoothArguments(height=height, width=width, adds=1)  # to those of normal consistency
-            structures.fill(smooth, normal=images["normal"], alpha=images["alpha"], g_normal=upstream["normal"])
-            self.works.append(Work("normal_smoothness", -(-height * width // MEAN_PIXELS), THREADS, smooth))
-            self._smooth = smooth
-        self._silhouette: structures.SilhouetteArguments | None = None
+            given = {"normal": images["normal"], "alpha": images["alpha"], "g_normal": upstream["normal"]}
+            blocks = -(-height * width // MEAN_PIXELS)
+            self._smooth = self._add("normal_smoothness", blocks, given, size, adds=1)  # to those of normal consistency
         if "alpha" in upstream:
-            silhouette = structures.SilhouetteArguments(pixels=height * width)
-            structures.fill(silhouette, alpha=images["alpha"], g_alpha=upstream["alpha"])
-            self.works.append(Work("silhouette_vjp", blocks_of(height * width), THREADS, silhouette))
-            self._silhouette = silhouette
+            given, pixels = {"alpha": images["alpha"], "g_alpha": upstream["alpha"]}, height * width
+            self._silhouette = self._add("silhouette_vjp", blocks_of(pixels), given, pixels=pixels)
 
-    def set(self, step: WholeStep, view: structures.KernelView) -> None:
+    def _add(self, kernel: str, blocks: int, *named: Mapping[str, Any], **fields: Any) -> ctypes.Structure:
+        """Append a launch and return its arguments."""
+        self.works.append(work_of(kernel, blocks, *named, **fields))
+        return self.works[-1].arguments
+
+    def set(self, step: WholeStep, view: ctypes.Structure) -> None:
         """Write photograph, mask and weights. Scales are products in float32, as in autograd."""
         mask, photograph = None if step.mask is None else step.mask.data_ptr(), step.photograph.data_ptr()
         for arguments in self._comparing:
@@ -381,20 +380,18 @@ class _Losses:
         if self._normals is not None:
             normals, wanted = self._normals, step.losses.normals
             assert wanted is not None
-            normals.mask = mask
-            normals.object = photograph if wanted.of_object and step.photograph.shape[2] == 4 else None
-            normals.flatness = None if step.flatness is None else step.flatness.data_ptr()
-            normals.flat_more = np.float32(wanted.flat - 1)
-            normals.fx, normals.fy, normals.cx, normals.cy = view.fx, view.fy, view.cx, view.cy
-            normals.rotation = view.R
+            of_object = photograph if wanted.of_object and step.photograph.shape[2] == 4 else None
+            fill(normals, mask=mask, object=of_object, flatness=step.flatness, flat_more=np.float32(wanted.flat - 1))
+            fill(normals, **{name: getattr(view.camera, name) for name in ("fx", "fy", "cx", "cy")})
+            normals.rotation = view.camera.R
             normals.scale = np.float32(wanted.weight) * np.float32(1 / max(step.valid, 1))
         if self._smooth is not None:
             assert step.flatness is not None
-            self._smooth.mask, self._smooth.flatness = mask, step.flatness.data_ptr()
-            self._smooth.scale = np.float32(step.losses.smooth_normals) * np.float32(1 / max(step.valid, 1))
+            scale = np.float32(step.losses.smooth_normals) * np.float32(1 / max(step.valid, 1))
+            fill(self._smooth, mask=mask, flatness=step.flatness, scale=scale)
         if self._silhouette is not None:
-            self._silhouette.mask, self._silhouette.object = mask, photograph
-            self._silhouette.scale = np.float32(step.losses.silhouette or 0.0) / np.float32(max(step.valid, 1))
+            scale = np.float32(step.losses.silhouette or 0.0) / np.float32(max(step.valid, 1))
+            fill(self._silhouette, mask=mask, object=photograph, scale=scale)
 
 
 class _Adam:
@@ -402,22 +399,21 @@ class _Adam:
 
     def __init__(self, step: WholeStep, gradients: Mapping[str, Tensor], overflow: Tensor) -> None:
         beta1, beta2, eps = step.betas
-        arguments = structures.AdamArguments(weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps)
-        structures.fill(arguments, skip=overflow)
-        blocks = 0
-        self._slots: dict[str, structures.AdamAttribute] = {}
+        self.work = work_of("adam_step", 0, weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps, skip=overflow)
+        arguments, blocks = self.work.arguments, 0
+        self._slots: dict[str, ctypes.Structure] = {}
         for name, parameter in step.splats.items():
             one = step.learned.get(name)
             if one is None or parameter.numel() == 0:
                 continue
             slot = arguments.attributes[arguments.count]
-            structures.fill(slot, parameter=parameter, mean=one.mean, square=one.square)
-            structures.fill(slot, gradient=gradients[name], trained=one.trained)
+            fill(slot, parameter=parameter, mean=one.mean, square=one.square)
+            fill(slot, gradient=gradients[name], trained=one.trained)
             slot.elements, slot.first_block, slot.columns = parameter.numel(), blocks, math.prod(parameter.shape[1:])
             self._slots[name] = slot
             arguments.count += 1
             blocks += -(-parameter.numel() // ADAM_ELEMENTS)
-        self.work = Work("adam_step", blocks, THREADS, arguments)
+        self.work.blocks = blocks
 
     def set(self, step: WholeStep) -> None:
         """Write the learning rates."""
@@ -430,7 +426,7 @@ class _Adam:
 class _Plan:
     """The launches of an iteration in order, in two parts: up to the count of pairs, and after it."""
 
-    def __init__(self, arena: Arena, step: WholeStep, view: structures.KernelView, room: int) -> None:
+    def __init__(self, arena: Arena, step: WholeStep, view: ctypes.Structure, room: int) -> None:
         splats, count, tiles = dict(step.splats.items()), len(step.splats), int(view.tiles_x) * int(view.tiles_y)
         self.overflow = arena.get("overflow", 1, torch.int32)[:1].view(())
         self._sorting = sorting = _Sorting(arena, count, tiles, room)
@@ -478,8 +474,8 @@ class _Plan:
         if step.gathered and not _only_colors(step):
             names = {"signed_norms": "signed", "absolute_norms": "absolute", "counts": "count"}
             gathered = last.arguments.gathered
-            structures.fill(gathered, **{field: step.gathered.get(name) for field, name in names.items()})
-            structures.fill(gathered, radii=projected["radii"], skip=self.overflow)
+            fill(gathered, **{field: step.gathered.get(name) for field, name in names.items()})
+            fill(gathered, radii=projected["radii"], skip=self.overflow)
         self._adam = _Adam(step, gradients, self.overflow)
         self.afterwards += [blended, last, self._adam.work]
         self._seeing = [work for work in (*self.until_known, *self.afterwards) if takes_view(work)]
@@ -489,7 +485,7 @@ class _Plan:
         """Pairs that fit into the allocated memory."""
         return self._sorting.most_room
 
-    def set(self, step: WholeStep, view: structures.KernelView, room: int, pairs: Tensor) -> None:
+    def set(self, step: WholeStep, view: ctypes.Structure, room: int, pairs: Tensor) -> None:
         """Write what differs between iterations: camera, photograph, room, address of the count, and rates."""
         see(self._seeing, view)
         for work in self._of_room:

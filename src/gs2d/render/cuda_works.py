@@ -12,21 +12,7 @@ from typing import TypeAlias
 
 from torch import Tensor
 
-from gs2d.kernels.cuda.kernel_arguments import (
-    BlendArguments,
-    BlendColorsArguments,
-    BlendVjpArguments,
-    EmitArguments,
-    FeatureBuffers,
-    KernelView,
-    OrderArguments,
-    PieceBuffers,
-    ProjectArguments,
-    ProjectColorsArguments,
-    ProjectVjpArguments,
-    RangeArguments,
-    fill,
-)
+from gs2d.kernels.cuda.kernel_arguments import THREADS, structure, work_of
 from gs2d.kernels.cuda.launch import Work
 
 __all__ = [
@@ -43,10 +29,8 @@ __all__ = [
     "see",
     "splat_gradients",
     "takes_view",
-    "work_of",
 ]
 
-THREADS = 128
 ORDER_THREADS = 512  # order.cu
 MOST_PIECES = 1024  # about the number of blocks that a large GPU runs at once
 SHORTEST_PIECE = 128  # entries: 4 chunks, whose blending takes several times as long as adding up the pieces
@@ -61,26 +45,19 @@ def blocks_of(count: int) -> int:
     return -(-count // THREADS)
 
 
-def work_of(kernel: str, blocks: int, arguments: ctypes.Structure, *pointers: Pointers) -> Work:
-    """Return a launch with these pointers in its structure: tensors, addresses or None."""
-    for named in pointers:
-        fill(arguments, **named)
-    return Work(kernel, blocks, THREADS, arguments)
-
-
 def takes_view(work: Work) -> bool:
     """Whether a launch takes a view or parts of one."""
-    return isinstance(work.arguments, EmitArguments) or hasattr(work.arguments, "view")
+    return hasattr(work.arguments, "view") or isinstance(work.arguments, structure("EmitArguments"))
 
 
-def see(works: Iterable[Work], view: KernelView) -> None:
+def see(works: Iterable[Work], view: ctypes.Structure) -> None:
     """Write a view into launches that take one."""
     for work in works:
-        if isinstance(work.arguments, EmitArguments):
+        if hasattr(work.arguments, "view"):
+            work.arguments.view = view
+        else:
             for name in OF_EMISSION:
                 setattr(work.arguments, name, getattr(view, name))
-        else:
-            work.arguments.view = view
 
 
 def project(
@@ -88,19 +65,18 @@ def project(
 ) -> Work:
     """Project splats to records and footprints: of blending, or with ``errors`` of rho <= error_cutoff^2."""
     count = len(splats["means"])
-    arguments = ProjectArguments(count=count, sh_rest=splats["shN"].shape[1], errors=int(errors), exact=int(exact))
-    return work_of("project_splats", blocks_of(count), arguments, splats, projected)
+    options = {"count": count, "sh_rest": splats["shN"].shape[1], "errors": int(errors), "exact": int(exact)}
+    return work_of("project_splats", blocks_of(count), splats, projected, options)
 
 
 def emit(kernel: str, room: int, visible: int, pointers: Pointers, *, exact: bool = True) -> Work:
     """Emit the pairs of splat and tile."""
-    arguments = EmitArguments(candidates=room, visible=visible, exact=int(exact))
-    return work_of(kernel, blocks_of(room), arguments, pointers)
+    return work_of(kernel, blocks_of(room), pointers, candidates=room, visible=visible, exact=int(exact))
 
 
 def find_ranges(bits: int, room: int, pointers: Pointers) -> Work:
     """Find each tile's range in the sorted pairs, whose keys have ``bits`` bits."""
-    return work_of(f"find_ranges_{bits}", blocks_of(room), RangeArguments(candidates=room), pointers)
+    return work_of(f"find_ranges_{bits}", blocks_of(room), pointers, candidates=room)
 
 
 def piece_words(room: int) -> int:
@@ -108,28 +84,25 @@ def piece_words(room: int) -> int:
     return min(MOST_PIECES, room // SHORTEST_PIECE) * (PIECE_STATE + PIECE_ROW) + 1
 
 
-def piece_buffers(memory: Tensor, words: int) -> PieceBuffers:
+def piece_buffers(memory: Tensor, words: int) -> ctypes.Structure:
     """Return the structure of the pieces: their states, then their table, in ``words`` as from :func:`piece_words`."""
     capacity, start = words // (PIECE_STATE + PIECE_ROW), memory.data_ptr()
-    return PieceBuffers(capacity, start + memory.element_size() * PIECE_STATE * capacity, start)
+    return structure("Pieces")(capacity, start + memory.element_size() * PIECE_STATE * capacity, start)
 
 
-def order_tiles(tiles: int, pointers: Pointers, pieces: PieceBuffers | None = None) -> Work:
+def order_tiles(tiles: int, pointers: Pointers, pieces: ctypes.Structure) -> Work:
     """Order tiles by their number of pairs, largest first, and cut long lists into pieces if there is room for them."""
-    arguments = OrderArguments(tiles=tiles, shortest=SHORTEST_PIECE, most=MOST_PIECES)
-    if pieces is not None:
-        arguments.capacity, arguments.pieces = pieces.capacity, pieces.table
-    work = work_of("order_tiles", 1, arguments, pointers)
-    work.threads = ORDER_THREADS
-    return work
+    limits = {"tiles": tiles, "shortest": SHORTEST_PIECE, "most": MOST_PIECES}
+    table = {"capacity": pieces.capacity, "pieces": pieces.table}
+    return work_of("order_tiles", 1, pointers, limits, table, threads=ORDER_THREADS)
 
 
-def blend(tiles: int, lists: Pointers, images: Pointers, pieces: PieceBuffers, *, distortion: bool) -> list[Work]:
+def blend(tiles: int, lists: Pointers, images: Pointers, pieces: ctypes.Structure, *, distortion: bool) -> list[Work]:
     """Blend the images from the lists of all tiles; first compute the transmittance of pieces of long lists."""
     name, capacity = f"blend_forward{'_distortion' if distortion else ''}", int(pieces.capacity)
-    works = [work_of(name, capacity + tiles, BlendArguments(pieces=pieces), lists, images)]
+    works = [work_of(name, capacity + tiles, lists, images, pieces=pieces)]
     if capacity > 0:
-        works.insert(0, work_of("pieces_forward", capacity, BlendArguments(pieces=pieces), lists))
+        works.insert(0, work_of("pieces_forward", capacity, lists, pieces=pieces))
     return works
 
 
@@ -139,10 +112,10 @@ def blend_gradients(
     images: Pointers,
     upstream: Pointers,
     sums: Pointers,
-    pieces: PieceBuffers,
+    pieces: ctypes.Structure,
     *,
     absolute: bool = False,
-    features: FeatureBuffers | None = None,
+    features: ctypes.Structure | None = None,
 ) -> Work:
     """Compute the gradients of the blending, summed for each splat.
 
@@ -155,18 +128,18 @@ def blend_gradients(
         Gradients of the images by name; absent or None: no gradient.
     sums : mapping
         "gradients", "extras", "slots" and "learns"; without "gradients", only colour gradients are computed.
-    pieces : PieceBuffers
+    pieces : structure "Pieces"
         Pieces of the forward pass, none if there are further channels.
     absolute : bool
         Whether to gather the absolute densification signal.
-    features : FeatureBuffers, optional
+    features : structure "Features", optional
         Further channels.
     """
     blocks = tiles + int(pieces.capacity)
     if sums.get("gradients") is None:
         colors = {"g_color": upstream["color"], "gradients": sums["extras"]}
         colors |= {name: sums.get(name) for name in ("learns", "slots")}
-        return work_of("blend_vjp_learning", blocks, BlendColorsArguments(pieces=pieces), lists, colors)
+        return work_of("blend_vjp_learning", blocks, lists, colors, pieces=pieces)
     given = {name: tensor for name, tensor in upstream.items() if tensor is not None}
     distortion, further = "distortion" in given, "depth_transmittance" in given
     if features is not None:
@@ -178,12 +151,10 @@ def blend_gradients(
     else:
         geometry = not given.keys().isdisjoint(("normal", "depth_mean", "depth_median"))
         kind = f"blend_vjp_{'geometry' if geometry else 'color'}"
-    arguments = BlendVjpArguments(pieces=pieces)
-    if features is not None:
-        arguments.features = features
-    kept = {name: image for name, image in images.items() if name != "depth_median"}
+    kept: dict[str, object] = {name: image for name, image in images.items() if name != "depth_median"}
+    kept |= {"pieces": pieces} | ({} if features is None else {"features": features})
     gradients = {f"g_{name}": tensor for name, tensor in given.items()}
-    return work_of(f"{kind}{'_abs' if absolute else ''}", blocks, arguments, lists, kept, gradients, sums)
+    return work_of(f"{kind}{'_abs' if absolute else ''}", blocks, lists, kept, gradients, sums)
 
 
 def splat_gradients(
@@ -207,7 +178,7 @@ def splat_gradients(
     if sums.get("gradients") is None:
         colors = {name: splats[name] for name in ("means", "sh0", "shN")} | wanted
         shared = {"tile_counts": sums["tile_counts"], "learns": sums.get("learns"), "gradients": sums["extras"]}
-        return work_of("project_colors_vjp", blocks_of(count), ProjectColorsArguments(**scalars), colors, shared)
+        return work_of("project_colors_vjp", blocks_of(count), scalars, colors, shared)
     probe = gradients.get("probe")
-    arguments = ProjectVjpArguments(**scalars, probe_columns=0 if probe is None else int(probe.shape[1]))
-    return work_of("project_splats_vjp", blocks_of(count), arguments, splats, sums, wanted)
+    scalars["probe_columns"] = 0 if probe is None else int(probe.shape[1])
+    return work_of("project_splats_vjp", blocks_of(count), scalars, splats, sums, wanted)

@@ -14,7 +14,7 @@ import torch
 from benchmarks.gpu.host import host_cost
 
 from emulate import Emulator
-from gs2d.kernels.cuda.kernel_arguments import OrderArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import arguments_of
 from gs2d.render import cuda_works
 
 # gs2d launches, device launches, torch operations, allocations. More than 256 tiles per image add a launch. The torch
@@ -59,8 +59,7 @@ def test_tiles_are_taken_longest_first_each_once(emulator: Emulator, lengths: li
     ranges = torch.zeros(len(lengths) + 1, 2, dtype=torch.int64)
     ranges[:-1, 1], ranges[1:-1, 0] = ends, ends[:-1]
     order = torch.full((len(lengths),), -1, dtype=torch.int32)
-    arguments = OrderArguments(tiles=len(lengths))
-    fill(arguments, ranges=ranges, order=order)
+    arguments = arguments_of("order_tiles", tiles=len(lengths), ranges=ranges, order=order)
     emulator.launch("order_tiles", 1, cuda_works.ORDER_THREADS, arguments)
     assert sorted(order.tolist()) == list(range(len(lengths)))
     chunks = [min(-(-lengths[tile] // 32), 511) for tile in order.tolist()]

@@ -15,7 +15,7 @@ from torch import Tensor
 from emulate import Emulator
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.kernels.cuda.kernel_arguments import OrderArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import work_of
 from gs2d.render import cuda_passes, cuda_works
 from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
@@ -158,9 +158,9 @@ def test_pieces_are_as_long_as_the_average_and_have_room(emulator: Emulator, len
     memory = torch.zeros(capacity * (cuda_works.PIECE_STATE + cuda_works.PIECE_ROW) + 1)
     table = parts_of(memory)[1].fill_(7)
     order = torch.empty(len(lengths), dtype=torch.int32)
-    arguments = OrderArguments(tiles=len(lengths), capacity=capacity, shortest=shortest, most=most)
-    fill(arguments, ranges=ranges, order=order, pieces=table if capacity else None)
-    emulator.launch("order_tiles", 1, cuda_works.ORDER_THREADS, arguments)
+    limits = {"tiles": len(lengths), "capacity": capacity, "shortest": shortest, "most": most}
+    tensors = {"ranges": ranges, "order": order, "pieces": table if capacity else None}
+    emulator.run([work_of("order_tiles", 1, limits, tensors, threads=cuda_works.ORDER_THREADS)])
     length = max(shortest, -(-sum(lengths) // most))
     expected = {tile: n // length for tile, n in enumerate(lengths) if n >= 2 * length}
     if capacity == 0:

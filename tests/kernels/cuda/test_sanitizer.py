@@ -28,12 +28,11 @@ emulator = Emulator(**{sys.argv[2]: True})
 """
 
 BEYOND = """
-from gs2d.kernels.cuda.kernel_arguments import PhotometricArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import work_of
 
-arguments = PhotometricArguments(20, 20)
 target, rendered = torch.rand(20 * 20 * 3 - 1), torch.rand(20 * 20 * 3)  # one number too few
-fill(arguments, rendered=rendered, target=target, partials=torch.rand(4))
-emulator.launch("photometric_forward", 1, 128, arguments)
+given = {"rendered": rendered, "target": target, "partials": torch.rand(4)}
+emulator.run([work_of("photometric_forward", 1, given, height=20, width=20)])
 """
 
 EVERYTHING = """
@@ -44,10 +43,10 @@ print("all done")
 """
 
 MISPLACED = """
-from gs2d.kernels.cuda.kernel_arguments import ClearArguments
+from gs2d.kernels.cuda.kernel_arguments import work_of
 
 words = torch.zeros(64)
-emulator.launch("clear_words", 1, 256, ClearArguments(words=words.data_ptr() + 4, count=3))  # of 16 bytes each
+emulator.run([work_of("clear_words", 1, threads=256, words=words.data_ptr() + 4, count=3)])  # of 16 bytes each
 """
 SANITIZERS = {"addresses": "libasan.so", "undefined": "libubsan.so"}
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from emulate import Emulator
-from gs2d.kernels.cuda.kernel_arguments import DigitArguments, RunningArguments, SortArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import work_of
 from gs2d.kernels.cuda.sort import (
     DIGITS,
     MOST_PASSES,
@@ -26,17 +26,16 @@ def sort(emulator: Emulator, keys: Tensor, payloads: Tensor | None, bits: int) -
     width = 16 if keys.dtype == torch.int16 else 32
     count, plan = len(keys), passes_of(bits)
     digits = torch.zeros(MOST_PASSES, DIGITS, dtype=torch.int32)
-    counting = DigitArguments(count=count, passes=len(plan))
-    fill(counting, keys=keys, digits=digits)
-    emulator.launch(f"count_digits_{width}", digit_blocks(count), SORT_THREADS, counting)
+    given = {"keys": keys, "digits": digits, "count": count, "passes": len(plan)}
+    emulator.run([work_of(f"count_digits_{width}", digit_blocks(count), given, threads=SORT_THREADS)])
     for number, (shift, of_digit) in enumerate(plan):
         words = torch.zeros(pieces_of(count) * DIGITS, dtype=torch.int32)
         ticket = torch.zeros(1, dtype=torch.int32)
         sorted_keys, sorted_payloads = torch.full_like(keys, -1), torch.full((count,), -1, dtype=torch.int32)
-        arguments = SortArguments(count=count, shift=shift, bits=of_digit)
-        fill(arguments, keys=keys, payloads=payloads, sorted_keys=sorted_keys, sorted_payloads=sorted_payloads)
-        fill(arguments, digits=digits[number], ticket=ticket, words=words)
-        emulator.launch(f"sort_pass_{width}", pieces_of(count), SORT_THREADS, arguments)
+        given = {"count": count, "shift": shift, "bits": of_digit, "keys": keys, "payloads": payloads}
+        given |= {"sorted_keys": sorted_keys, "sorted_payloads": sorted_payloads}
+        given |= {"digits": digits[number], "ticket": ticket, "words": words}
+        emulator.run([work_of(f"sort_pass_{width}", pieces_of(count), given, threads=SORT_THREADS)])
         keys, payloads = sorted_keys, sorted_payloads
     assert payloads is not None
     return keys, payloads
@@ -88,8 +87,7 @@ def run_counts(emulator: Emulator, order: Tensor, counts: Tensor, room: int) -> 
     ends, pairs = torch.full((count,), -1, dtype=torch.int32), torch.full((1,), -1, dtype=torch.int64)
     overflow, ticket = torch.full((1,), -1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
     words = torch.zeros(pieces_of(count), dtype=torch.int32)
-    arguments = RunningArguments(count=count, room=room)
-    fill(arguments, order=order, tile_counts=counts, ends=ends, ticket=ticket, words=words)
-    fill(arguments, pairs=pairs, overflow=overflow)
-    emulator.launch("running_counts", pieces_of(count), SORT_THREADS, arguments)
+    given = {"order": order, "tile_counts": counts, "ends": ends, "ticket": ticket, "words": words}
+    given |= {"pairs": pairs, "overflow": overflow, "count": count, "room": room}
+    emulator.run([work_of("running_counts", pieces_of(count), given, threads=SORT_THREADS)])
     return ends, int(pairs), int(overflow)

@@ -328,17 +328,17 @@ def test_an_iteration_uses_no_torch_operations(emulator: Emulator, scene: Scene)
 
 def test_a_byte_converts_to_the_same_number_as_by_division(emulator: Emulator) -> None:
     """A row of all 256 values against a float target has an L1 of exactly 0."""
-    from gs2d.kernels.cuda.cuda_losses import THREADS, strips
-    from gs2d.kernels.cuda.kernel_arguments import PhotometricArguments, fill
+    from gs2d.kernels.cuda.cuda_losses import strips
+    from gs2d.kernels.cuda.kernel_arguments import work_of
 
     width = 86  # 258 reals
     values = torch.arange(3 * width) % 256
     rendered = (values.to(torch.float32) / 255).view(1, width, 3).contiguous()
     partials = torch.full((4, strips(1, width)), torch.nan)  # valid reals, L1, SSIM, L2
-    arguments, pixels = PhotometricArguments(1, width), values.to(torch.uint8)
-    fill(arguments, rendered=rendered, partials=partials)
-    arguments.photograph.bytes = pixels.data_ptr()
-    emulator.launch("photometric_forward_rgb", strips(1, width), THREADS, arguments)
+    pixels, size = values.to(torch.uint8), {"height": 1, "width": width}
+    work = work_of("photometric_forward_rgb", strips(1, width), size, rendered=rendered, partials=partials)
+    work.arguments.photograph.bytes = pixels.data_ptr()
+    emulator.run([work])
     assert float(partials[1].sum()) == 0
     assert float(partials[0].sum()) == 3 * width
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.cuda_losses import ready
-from gs2d.kernels.cuda.kernel_arguments import AdamArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import arguments_of, fill
 from gs2d.kernels.native_adam import AdamUpdate, bias_corrections, check_update
 
 if TYPE_CHECKING:
@@ -51,8 +51,7 @@ def adam_step(
     """
     if len(updates) > 6:
         raise ShapeError(f"adam_step takes up to 6 attributes, got {len(updates)}")
-    arguments = AdamArguments(weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps)
-    fill(arguments, skip=skip)
+    arguments = arguments_of("adam_step", weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps, skip=skip)
     alive = []  # tensors behind the pointers
     blocks = 0
     for update in updates:

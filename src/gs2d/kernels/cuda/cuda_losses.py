@@ -7,6 +7,7 @@ formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in t
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -18,15 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
-from gs2d.kernels.cuda.kernel_arguments import (
-    FinishArguments,
-    MeanArguments,
-    NormalArguments,
-    PhotometricArguments,
-    PhotometricVjpArguments,
-    SmoothArguments,
-    fill,
-)
+from gs2d.kernels.cuda.kernel_arguments import THREADS, arguments_of
 from gs2d.kernels.native_losses import NormalOptions, check_smoothness, needs_gradient
 
 if TYPE_CHECKING:
@@ -34,7 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["masked_mean", "normal_consistency", "normal_smoothness", "photometric", "strips"]
 
-THREADS = 128
 STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows per block
 MEAN_PIXELS = 1024  # losses.cu: pixels per block
 NORMAL_W, NORMAL_H = 32, 8  # losses.cu: tile of the backward pass
@@ -72,8 +64,8 @@ def strips(height: int, width: int) -> int:
 def _finish(launcher: Launcher, partials: Tensor, *, complement: bool = False) -> Tensor:
     """Return [1 / count, mean, ...] from the blocks' [count, sum, ...], one row each."""
     means = partials.new_empty(len(partials))
-    arguments = FinishArguments(blocks=partials.shape[1], values=len(partials) - 1, complement=int(complement))
-    fill(arguments, partials=partials, means=means)
+    counts = {"blocks": partials.shape[1], "values": len(partials) - 1, "complement": int(complement)}
+    arguments = arguments_of("finish_means", counts, partials=partials, means=means)
     launcher.launch("finish_means", 1, THREADS, arguments)
     return means
 
@@ -93,8 +85,8 @@ class _CudaPhotometric(torch.autograd.Function):
         partials = rendered.new_empty(4, blocks)
         maps = rendered.new_empty(3, height, width, 3) if wanted else None
         if blocks > 0:
-            arguments = PhotometricArguments(height, width)
-            fill(arguments, rendered=rendered, target=target, mask=mask, maps=maps, partials=partials)
+            given = {"rendered": rendered, "target": target, "mask": mask, "maps": maps, "partials": partials}
+            arguments = arguments_of("photometric_forward", given, height=height, width=width)
             launcher.launch("photometric_forward", blocks, THREADS, arguments)
         means = _finish(launcher, partials)
         ctx.launcher = launcher
@@ -109,10 +101,10 @@ class _CudaPhotometric(torch.autograd.Function):
         gradient = torch.empty_like(rendered)
         height, width = rendered.shape[:2]
         if gradient.numel() > 0:
-            arguments = PhotometricVjpArguments(height, width)
-            fill(arguments, rendered=rendered, target=target, mask=mask, maps=maps, means=means, gradient=gradient)
             cotangents = dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, given), strict=True))
-            fill(arguments, **cotangents)
+            tensors = {"rendered": rendered, "target": target, "mask": mask, "maps": maps, "means": means}
+            tensors |= {"gradient": gradient}
+            arguments = arguments_of("photometric_vjp", tensors, cotangents, height=height, width=width)
             ctx.launcher.launch("photometric_vjp", strips(height, width), THREADS, arguments)
         return gradient, None, None, None, None
 
@@ -158,16 +150,13 @@ def photometric(
     return l1, ssim, l2
 
 
-def _normal_arguments(images: Sequence[Tensor], how: NormalOptions, **more: Tensor | None) -> NormalArguments:
+def _normal_arguments(images: Sequence[Tensor], how: NormalOptions, **more: Tensor | None) -> ctypes.Structure:
     normal, depth, alpha = images
-    camera = how.camera
-    arguments = NormalArguments(
-        height=camera.height, width=camera.width, per_splat=int(how.per_splat), at_camera=int(how.at_camera)
-    )
-    for name in ("fx", "fy", "cx", "cy"):
-        setattr(arguments, name, float(getattr(camera, name)))
-    arguments.rotation[:] = np.asarray(camera.rotation).ravel().tolist()
-    fill(arguments, normal=normal, depth=depth, alpha=alpha, mask=how.mask, weights=how.weights, **more)
+    tensors = {"normal": normal, "depth": depth, "alpha": alpha, "mask": how.mask, "weights": how.weights, **more}
+    options = {"per_splat": int(how.per_splat), "at_camera": int(how.at_camera)}
+    lens = {name: getattr(how.camera, name) for name in ("height", "width", "fx", "fy", "cx", "cy")}
+    arguments = arguments_of("normal_consistency", tensors, options, lens)
+    arguments.rotation[:] = np.asarray(how.camera.rotation).ravel().tolist()
     return arguments
 
 
@@ -271,8 +260,9 @@ class _CudaNormalSmoothness(torch.autograd.Function):
 def _smoothness(launcher: Launcher, images: Sequence[Tensor | None], **more: Tensor | None) -> None:
     normal, alpha, flatness, mask = images
     assert normal is not None
-    arguments = SmoothArguments(*normal.shape[:2])
-    fill(arguments, normal=normal, alpha=alpha, flatness=flatness, mask=mask, **more)
+    given = {"normal": normal, "alpha": alpha, "flatness": flatness, "mask": mask}
+    height, width = normal.shape[:2]
+    arguments = arguments_of("normal_smoothness", given, more, height=height, width=width)
     if normal.numel() > 0:
         launcher.launch("normal_smoothness", -(-normal.shape[0] * normal.shape[1] // MEAN_PIXELS), THREADS, arguments)
 
@@ -301,8 +291,9 @@ class _CudaMaskedMean(torch.autograd.Function):
         blocks = -(-values.numel() // MEAN_PIXELS)
         partials = values.new_empty(2, blocks)
         if blocks > 0:
-            arguments = MeanArguments(*values.shape)
-            fill(arguments, values=values, mask=mask, partials=partials)
+            height, width = values.shape
+            given = {"values": values, "mask": mask, "partials": partials}
+            arguments = arguments_of("masked_mean", given, height=height, width=width)
             launcher.launch("masked_mean", blocks, THREADS, arguments)
         means = _finish(launcher, partials)
         ctx.shape = values.shape
