@@ -18,8 +18,9 @@ from benchmarks.workload import Workload
 from gs2d.config.presets import two_dgs_r
 from gs2d.config.recipe import GradDensify
 from gs2d.core.splats import Splats
-from gs2d.kernels import native_losses as ops
 from gs2d.kernels.library import Library
+from gs2d.kernels.loss_operations import NormalOptions
+from gs2d.kernels.native_losses import NativeLosses
 from gs2d.render.backends import get_backend
 from gs2d.render.native_rasterizer import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -134,12 +135,13 @@ def loss_step(output: RenderOutput, workload: Workload) -> Callable[[], float]:
     generator = torch.Generator().manual_seed(3)
     noise = torch.randn(leaves["color"].shape, generator=generator)
     target = (leaves["color"].detach() + 0.1 * noise).clamp(0, 1)
+    ops = NativeLosses()
     mean = ops.blur(target)
 
     def step() -> float:
         start = time.perf_counter()
         l1, ssim, _ = ops.photometric(leaves["color"], target, None, mean)
-        normal = ops.normal_consistency(leaves["normal"], leaves["depth_mean"], alpha, ops.NormalOptions(camera))
+        normal = ops.normal_consistency(leaves["normal"], leaves["depth_mean"], alpha, NormalOptions(camera))
         total = 0.8 * l1 - 0.2 * ssim + 0.05 * normal + 100.0 * ops.masked_mean(leaves["distortion"], None)
         torch.autograd.grad(total, list(leaves.values()))
         return 1e3 * (time.perf_counter() - start)

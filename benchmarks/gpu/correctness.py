@@ -23,9 +23,9 @@ from benchmarks.gpu.probes import ceilings
 from benchmarks.kernel_usage import usage_of
 from gs2d.config.recipe import Stage
 from gs2d.core.splats import Splats
-from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
+from gs2d.kernels.cuda.cuda_losses import CudaLosses
 from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
 from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
@@ -170,8 +170,9 @@ def _all_losses(bench: Bench) -> None:
     """Run L1, SSIM and L2 and the mean of a map; training covers the other losses."""
     launcher = launch.launcher_for(bench.device)
     image, target = (torch.rand(45, 70, 3, device=bench.device, requires_grad=k == 0) for k in range(2))
-    l1, ssim, l2 = ops.photometric(image, target, launcher=launcher)
-    (l1 + ssim + l2 + ops.masked_mean(image[..., 0], target[..., 0] > 0.5, launcher=launcher)).backward()
+    ops = CudaLosses(launcher)
+    l1, ssim, l2 = ops.photometric(image, target)
+    (l1 + ssim + l2 + ops.masked_mean(image[..., 0], target[..., 0] > 0.5)).backward()
 
 
 def _three_stages(bench: Bench) -> None:

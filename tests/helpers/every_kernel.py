@@ -10,9 +10,9 @@ from torch import Tensor
 
 from emulate import Emulator
 from gs2d.core.splats import Splats
-from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.cuda.cuda_adam import AdamUpdate, adam_step
-from gs2d.kernels.native_losses import NormalOptions
+from gs2d.kernels.cuda.cuda_losses import CudaLosses
+from gs2d.kernels.loss_operations import NormalOptions
 from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
@@ -73,14 +73,14 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
 
 def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
     """Return values and gradients of all losses."""
-    g, found = _numbers(), {}
+    g, found, ops = _numbers(), {}, CudaLosses(emulator)
     for size in ((37, 44), (1, 1), (12, 43)):
         x, y, m = torch.rand(*size, 3, generator=g), torch.rand(*size, 3, generator=g), torch.rand(*size, generator=g)
         x, m = x.requires_grad_(), m > 0.4
         depth = torch.rand(*size, generator=g).add(1).requires_grad_()
         alpha = torch.rand(*size, generator=g).requires_grad_()
-        known = ops.photometric(x, y, m, launcher=emulator)
-        values = ops.photometric(x, y, launcher=emulator)
+        known = ops.photometric(x, y, m)
+        values = ops.photometric(x, y)
         camera = case.camera.resized(size[1], size[0])
         normals = sum(
             ops.normal_consistency(
@@ -88,11 +88,10 @@ def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
                 depth,
                 alpha,
                 NormalOptions(camera, m, y[..., 0].contiguous(), at_camera=form, per_splat=form),
-                launcher=emulator,
             )
             for form in (False, True)
         )
-        total = sum(known) + sum(values) + normals + ops.masked_mean(depth, m, launcher=emulator)
+        total = sum(known) + sum(values) + normals + ops.masked_mean(depth, m)
         total.backward()
         results = {"value": total.detach(), "x": x.grad, "depth": depth.grad, "alpha": alpha.grad}
         found |= {f"losses {size}.{name}": value for name, value in results.items() if value is not None}

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.kernels import native_losses as ops
 from gs2d.kernels.library import Library
-from gs2d.kernels.native_losses import NormalOptions
+from gs2d.kernels.loss_operations import NormalOptions
+from gs2d.kernels.native_losses import NativeLosses
 from gs2d.losses import formulas as reference
 from loss_images import geometry, photographs, relative_error, wide_camera
 
@@ -24,7 +24,7 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
     valid = mask if masked else None
     x, y = rendered.float().requires_grad_(), target.float()
     exact, exact_y = x.detach().double().requires_grad_(), y.double()  # exactly the inputs of the native op
-    values = ops.photometric(x, y, valid, library=native)
+    values = NativeLosses(native).photometric(x, y, valid)
     exact_values = [value(exact, exact_y, valid) for value in (reference.l1, reference.ssim, reference.l2)]
     for value, exact_value, atol in zip(values, exact_values, (1e-7, 1e-6, 1e-7), strict=True):
         assert value.item() == pytest.approx(exact_value.item(), abs=atol)
@@ -56,7 +56,7 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     found_in = [image.float().requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in found_in]
     how = NormalOptions(camera, valid, weights, edges == "camera", per_splat)
-    value = ops.normal_consistency(*found_in, how, library=native)
+    value = NativeLosses(native).normal_consistency(*found_in, how)
     function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
     exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
@@ -90,7 +90,7 @@ def test_normal_smoothness_and_its_gradient_are_those_of_the_reference(
     given = (alpha, flatness, mask if masked else None)
     normal.requires_grad_()
     exact_normal = normal.detach().double().requires_grad_()
-    value = ops.normal_smoothness(normal, *given, expected=0.8, library=native)
+    value = NativeLosses(native).normal_smoothness(normal, *given, expected=0.8)
     exact = reference.normal_smoothness(exact_normal, *given)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
     for cotangent in (0.8, 3.0):  # the first matches the gradient computed in the forward pass
@@ -105,7 +105,7 @@ def test_the_masked_mean_and_its_gradient_are_those_of_the_reference(native: Lib
     for valid in (None, mask, torch.zeros_like(mask)):
         x = values.float().requires_grad_()
         exact = x.detach().double().requires_grad_()
-        found, expected = ops.masked_mean(x, valid, library=native), reference.distortion(exact, valid)
+        found, expected = NativeLosses(native).masked_mean(x, valid), reference.distortion(exact, valid)
         assert found.item() == pytest.approx(expected.item(), abs=1e-6)
         (gradient,) = torch.autograd.grad(3 * found, x)
         torch.testing.assert_close(gradient, 3 * torch.autograd.grad(expected, exact)[0].float())
@@ -118,28 +118,24 @@ def test_the_native_formulas_pass_a_float64_gradient_check(native64: Library, ma
     rendered = torch.where((rendered - target).abs() < 1e-3, target + 0.05, rendered)  # |x - y| has a kink
     valid = mask if masked else None
     assert torch.autograd.gradcheck(
-        lambda x: ops.photometric(x, target, valid, library=native64), (rendered.requires_grad_(),)
+        lambda x: NativeLosses(native64).photometric(x, target, valid), (rendered.requires_grad_(),)
     )
     normal, depth, alpha, _ = geometry(*size, seed=4)
     camera = wide_camera(*size)
     inputs = (normal.requires_grad_(), torch.where(depth > 0, depth, 2.5).requires_grad_(), alpha.requires_grad_())
     assert torch.autograd.gradcheck(
-        lambda *x: ops.normal_consistency(*x, NormalOptions(camera, valid, per_splat=True), library=native64), inputs
+        lambda *x: NativeLosses(native64).normal_consistency(*x, NormalOptions(camera, valid, per_splat=True)), inputs
     )
     how = NormalOptions(camera, valid)
     assert torch.autograd.gradcheck(  # alpha is detached in this form
-        lambda n, d: ops.normal_consistency(n, d, alpha.detach(), how, library=native64),
+        lambda n, d: NativeLosses(native64).normal_consistency(n, d, alpha.detach(), how),
         inputs[:2],
     )
-    assert torch.autograd.gradcheck(lambda x: ops.masked_mean(x, valid, library=native64), (inputs[2],))
+    assert torch.autograd.gradcheck(lambda x: NativeLosses(native64).masked_mean(x, valid), (inputs[2],))
     weights, empty = geometry(*size, seed=5)[2], geometry(*size, seed=6, empty=0.3)[1] == 0
     assert torch.autograd.gradcheck(
-        lambda n, d: ops.normal_consistency(
-            n,
-            torch.where(empty, 0.0, d),
-            alpha.detach(),
-            NormalOptions(camera, valid, weights, at_camera=True),
-            library=native64,
+        lambda n, d: NativeLosses(native64).normal_consistency(
+            n, torch.where(empty, 0.0, d), alpha.detach(), NormalOptions(camera, valid, weights, at_camera=True)
         ),
         inputs[:2],
     )
@@ -153,14 +149,14 @@ def everything(native: Library, height: int = 150, width: int = 41) -> list[Tens
     x, n, z, a = leaves
     y, camera = target.float(), wide_camera(height, width)
     values = [
-        *ops.photometric(x, y, mask, library=native),
-        *ops.photometric(x, y, library=native),
-        ops.normal_consistency(n, z, a, NormalOptions(camera, mask), library=native),
-        ops.normal_consistency(n, z, a, NormalOptions(camera, per_splat=True), library=native),
-        ops.normal_consistency(n, z, a, NormalOptions(camera, weights=y[..., 0], at_camera=True), library=native),
-        ops.masked_mean(a, mask, library=native),
+        *NativeLosses(native).photometric(x, y, mask),
+        *NativeLosses(native).photometric(x, y),
+        NativeLosses(native).normal_consistency(n, z, a, NormalOptions(camera, mask)),
+        NativeLosses(native).normal_consistency(n, z, a, NormalOptions(camera, per_splat=True)),
+        NativeLosses(native).normal_consistency(n, z, a, NormalOptions(camera, weights=y[..., 0], at_camera=True)),
+        NativeLosses(native).masked_mean(a, mask),
     ]
-    return [*values, *torch.autograd.grad(sum(values), leaves), ops.blur(y, library=native)]
+    return [*values, *torch.autograd.grad(sum(values), leaves), NativeLosses(native).blur(y)]
 
 
 def test_every_bit_is_the_same_for_any_number_of_threads(native: Library) -> None:
@@ -177,8 +173,8 @@ def test_a_cached_target_mean_changes_no_bit(native: Library, masked: bool) -> N
     rendered, target, mask = photographs(45, 38, seed=8)
     x, y, valid = rendered.float().requires_grad_(), target.float(), mask if masked else None
     results = []
-    for mean in (None, ops.blur(y, library=native)):
-        l1, ssim, l2 = ops.photometric(x, y, valid, mean, library=native)
+    for mean in (None, NativeLosses(native).blur(y)):
+        l1, ssim, l2 = NativeLosses(native).photometric(x, y, valid, mean)
         results.append((l1, ssim, l2, *torch.autograd.grad(0.8 * l1 - 0.2 * ssim + l2, x)))
     for found, wanted in zip(*results, strict=True):
         assert torch.equal(found, wanted)
@@ -188,23 +184,23 @@ def test_nan_at_a_valid_pixel_reaches_the_loss(native: Library) -> None:
     rendered, target, _ = photographs(20, 20)
     x = rendered.float()
     x[3, 4, 1] = float("nan")
-    assert all(value.isnan() for value in ops.photometric(x, target.float(), library=native))
+    assert all(value.isnan() for value in NativeLosses(native).photometric(x, target.float()))
     camera = wide_camera(20, 20)
     for bad in range(3):
         images = [image.float() for image in geometry(20, 20)[:3]]
         images[1][images[1] == 0] = 2.5
         images[bad][7, 8] = float("nan")
-        assert ops.normal_consistency(*images, NormalOptions(camera), library=native).isnan()
+        assert NativeLosses(native).normal_consistency(*images, NormalOptions(camera)).isnan()
         assert reference.normal_consistency(*images, camera).isnan()
         images[1][7, 7] = 0  # beside it
-        assert ops.normal_consistency(*images, NormalOptions(camera, at_camera=True), library=native).isnan()
+        assert NativeLosses(native).normal_consistency(*images, NormalOptions(camera, at_camera=True)).isnan()
         assert reference.normal_consistency(*images, camera, edges="camera").isnan()
 
 
 def test_a_target_changed_before_backward_is_an_error_not_a_wrong_gradient(native: Library) -> None:
     rendered, target, _ = photographs(9, 9)
     x, y = rendered.float().requires_grad_(), target.float().contiguous()
-    l1, *_ = ops.photometric(x, y, library=native)
+    l1, *_ = NativeLosses(native).photometric(x, y)
     y.zero_()
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         l1.backward()

@@ -20,7 +20,7 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import RecipeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.library import available_variants
-from gs2d.kernels.native_losses import LossOperations
+from gs2d.kernels.loss_operations import LossOperations
 from gs2d.losses.base import Loss, Losses, LossView, compute_losses
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RenderOutput

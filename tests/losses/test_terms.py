@@ -14,7 +14,7 @@ from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.recipe import LossTerm, Recipe, Stage
 from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
-from gs2d.kernels import native_losses
+from gs2d.kernels.native_losses import NativeLosses
 from gs2d.losses import formulas as reference
 from gs2d.losses.base import Losses, LossView, compute_losses, losses_of
 from gs2d.losses.prior_formulas import MetricDepth, NormalTarget
@@ -235,7 +235,7 @@ def test_a_wrong_argument_is_refused_in_one_line(change: dict[str, object], erro
 
 def test_the_mean_of_a_target_changes_no_value(native: None) -> None:
     output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.rand(8, 9, 3)
-    views = LossView(target, camera), LossView(target, camera, target_mean=native_losses.blur(target))
+    views = LossView(target, camera), LossView(target, camera, target_mean=NativeLosses().blur(target))
     plain, kept = (compute_losses(output, view, [LossTerm("ssim", 1.0)], backend="cpu")["ssim"] for view in views)
     assert torch.equal(plain, kept)
 

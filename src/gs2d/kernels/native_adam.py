@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gs2d.errors import ShapeError
+from gs2d.kernels.c_structures import fill, structure
 from gs2d.kernels.library import Library, ready_library
 
 __all__ = ["AdamUpdate", "adam_step", "bias_corrections", "check_update", "first_not_finite"]
@@ -76,16 +77,6 @@ def bias_corrections(rate: float, step: float, beta1: float, beta2: float) -> tu
     return rate / (1 - beta1**step), math.sqrt(1 - beta2**step)
 
 
-class _Attribute(ctypes.Structure):
-    """``struct AdamAttribute`` of kernels/cpu/adam.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("parameter", "mean", "square", "gradient", "rows")),
-        *((name, ctypes.c_int64) for name in ("height", "count", "columns", "compact")),
-        *((name, ctypes.c_double) for name in ("step_size", "root_2")),
-    )
-
-
 @torch.no_grad()
 def adam_step(
     updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float, library: Library | None = None
@@ -106,14 +97,13 @@ def adam_step(
         If a tensor has another shape, dtype or device, or a row index is out of range.
     """
     library = library or ready_library()
-    attributes = (_Attribute * len(updates))()
+    attributes = (structure("AdamAttribute", "cpu/adam.cpp") * len(updates))()
     alive = []  # tensors behind the pointers
     for slot, update in zip(attributes, updates, strict=True):
         check_update(update)
         named = {name: getattr(update, name) for name in ("parameter", "mean", "square", "gradient")}
         tensors = library.arrays(**named)
-        for name, tensor in zip(named, tensors, strict=True):
-            setattr(slot, name, tensor.data_ptr())
+        fill(slot, **dict(zip(named, tensors, strict=True)))
         rows = update.rows if update.trained is None else update.trained.nonzero().squeeze(1)
         if rows is not None:
             if not rows.is_cpu:

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import load
 
 __all__ = ["CollapseArrays", "CollapseRules", "collapse"]
 
 _CANDIDATE_BYTES = 24  # of cpu/collapse.cpp
-_RULES = ("target", "limit", "length_weight", "tint_weight", "border_weight", "turn", "pull")
 
 
 class CollapseRules(NamedTuple):
@@ -80,17 +80,6 @@ class CollapseArrays:
         )
 
 
-class _CollapseArguments(ctypes.Structure):
-    """``CollapseArguments`` of cpu/collapse.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("vertices", "faces", "capacity", _RULES[0])),
-        *((name, ctypes.c_double) for name in _RULES[1:]),
-        *((field.name, ctypes.c_void_p) for field in fields(CollapseArrays)),
-        *((name, ctypes.c_void_p) for name in ("next", "head", "tail", "stamp", "mark", "border", "heap")),
-    )
-
-
 def collapse(arrays: CollapseArrays, rules: CollapseRules) -> None:
     """Collapse edges in place, with 180 bytes per face of temporary memory."""
     library = load()
@@ -100,7 +89,7 @@ def collapse(arrays: CollapseArrays, rules: CollapseRules) -> None:
     work |= {"border": np.empty(count, np.uint8), "next": np.empty(3 * faces, np.int32)}
     work["heap"] = np.empty(capacity * _CANDIDATE_BYTES, np.uint8)
     inputs = {field.name: getattr(arrays, field.name) for field in fields(arrays)}
-    pointers = {name: None if array is None else array.ctypes.data for name, array in (inputs | work).items()}
-    rules_of = dict(zip(_RULES, rules, strict=True))
-    arguments = _CollapseArguments(vertices=count, faces=faces, capacity=capacity, **rules_of, **pointers)
+    sizes = {"vertices": count, "faces": faces, "capacity": capacity}
+    kind = structure("CollapseArguments", "cpu/collapse.cpp")
+    arguments = filled(kind, **sizes, **rules._asdict(), **inputs, **work)
     library.function("gs2d_collapse", None, [ctypes.c_void_p])(ctypes.byref(arguments))

@@ -8,22 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import library_for
 
 __all__ = ["SeenSpace", "look_at_free_space"]
-
-
-class _FreeSpaceArguments(ctypes.Structure):
-    """``FreeSpaceArguments`` of cpu/free_space.cpp, with float32 arrays."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("count", "places", "height", "width")),
-        *((name, ctypes.c_void_p) for name in ("ends", "reach", "project", "center")),
-        ("radius", ctypes.c_float),
-        *((name, ctypes.c_void_p) for name in ("limit", "known")),
-        ("fraction", ctypes.c_float),
-        *((name, ctypes.c_void_p) for name in ("against", "support")),
-    )
 
 
 class SeenSpace(NamedTuple):
@@ -76,16 +64,9 @@ def look_at_free_space(ends: Tensor, reach: Tensor, seen: SeenSpace, against: Te
     inputs |= {name: getattr(seen, name) for name in ("project", "center", "limit", "known")}
     given = {name: tensor.contiguous() for name, tensor in inputs.items()}
     height, width = seen.limit.shape
-    arguments = _FreeSpaceArguments(
-        count=ends.shape[1],
-        places=len(ends),
-        height=height,
-        width=width,
-        radius=seen.radius,
-        fraction=seen.fraction,
-        against=against.data_ptr(),
-        support=support.data_ptr(),
-        **{name: tensor.data_ptr() for name, tensor in given.items()},
-    )
+    sizes = {"count": ends.shape[1], "places": len(ends), "height": height, "width": width}
+    limits = {"radius": seen.radius, "fraction": seen.fraction}
+    kind = structure("FreeSpaceArguments", "cpu/free_space.cpp")
+    arguments = filled(kind, **sizes, **limits, **given, against=against, support=support)
     library.function("gs2d_free_space", None, [ctypes.c_void_p])(ctypes.byref(arguments))
     return True

@@ -1,25 +1,24 @@
-"""Native image losses for autograd: fused value and gradient, the same bits for any number of threads.
+"""Native image losses for autograd: the same bits for any number of threads.
 
 Each function computes the gradient in its forward pass, for the expected cotangent (the weight of the loss term), and
-returns it in the backward pass. Another cotangent also gives the correct gradient, at the cost of a second pass. The
-formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in torch.
+returns it in the backward pass. Another cotangent also gives the correct gradient, at the cost of a second pass.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
-from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, ready_library
+from gs2d.kernels.loss_operations import LossOperations, NormalOptions
+
+__all__ = ["NativeLosses"]
 
 POINTER, INT64, DOUBLE, INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_int
 SIGNATURES: dict[str, list[Any]] = {
@@ -31,88 +30,11 @@ SIGNATURES: dict[str, list[Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class LossOperations:
-    """The fused loss operations of a backend, with the signatures of this module.
-
-    Attributes
-    ----------
-    photometric, normal_consistency, normal_smoothness, masked_mean : callable
-    blur : callable or None
-        Computes the local mean of the target for ``photometric``; None: caching it does not save time.
-    """
-
-    photometric: Callable[..., tuple[Tensor, Tensor, Tensor]]
-    normal_consistency: Callable[..., Tensor]
-    normal_smoothness: Callable[..., Tensor]
-    masked_mean: Callable[..., Tensor]
-    blur: Callable[[Tensor], Tensor] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class NormalOptions:
-    """Inputs and options of normal consistency.
-
-    Attributes
-    ----------
-    camera : Camera
-    mask : Tensor [H, W] bool or None
-        False = ignore this pixel.
-    weights : Tensor [H, W] or None
-        Constant weight of each pixel.
-    at_camera : bool
-        Whether empty pixels lie at the camera centre: ``edges`` of ``losses.formulas.normals_from_depth``.
-    per_splat : bool
-        Use the paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
-    """
-
-    camera: Camera
-    mask: Tensor | None = None
-    weights: Tensor | None = None
-    at_camera: bool = False
-    per_splat: bool = False
-
-    def check(self, normal: Tensor, depth: Tensor, alpha: Tensor) -> None:
-        """Raise ShapeError if the images do not have the size of the camera."""
-        shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
-        shapes |= {} if self.mask is None else {"mask": (self.mask, "H W")}
-        sizes = check_shapes(shapes | ({} if self.weights is None else {"weights": (self.weights, "H W")}))
-        camera = self.camera
-        if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
-            raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
-
-
 def _call(library: Library, name: str, *arguments: Any) -> None:
     """Call an exported function with the addresses of tensors; None becomes null."""
     pointers = [x.data_ptr() if isinstance(x, Tensor) else x for x in arguments]
     if library.function(name, INT, SIGNATURES[name])(*pointers) != 0:
         raise MemoryError(f"{name} could not allocate its scratch rows")
-
-
-def needs_gradient(*tensors: Tensor) -> bool:
-    """Whether autograd records these tensors (an autograd.Function cannot tell in its forward pass)."""
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-
-
-def _mask_bytes(mask: Tensor | None) -> Tensor | None:
-    if mask is None:
-        return None
-    if mask.dtype != torch.bool or mask.device.type != "cpu":
-        raise ShapeError(f"mask must be bool on the cpu, got {mask.dtype} on {mask.device}")
-    return mask.contiguous()
-
-
-def blur(image: Tensor, *, library: Library | None = None) -> Tensor:
-    """Filter an image [H, W, 3] with the SSIM window (11x11 Gaussian, sigma 1.5, zero outside); not differentiable.
-
-    The result for a target is the ``target_mean`` of ``photometric``.
-    """
-    library = library or ready_library()
-    sizes = check_shapes({"image": (image, "H W 3")})
-    (source,) = library.arrays(image=image)
-    out = torch.empty_like(source)
-    _call(library, "gs2d_blur", source, sizes["H"], sizes["W"], out)
-    return out
 
 
 class _Photometric(torch.autograd.Function):
@@ -161,54 +83,6 @@ def _photometric(
     return values.to(rendered.dtype)
 
 
-def photometric(
-    rendered: Tensor,
-    target: Tensor,
-    mask: Tensor | None = None,
-    target_mean: Tensor | None = None,
-    *,
-    expected: tuple[float, float, float] = (0.8, -0.2, 0.0),
-    library: Library | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean L1, SSIM and L2 of an image, all differentiable in ``rendered``, in one fused pass.
-
-    Parameters
-    ----------
-    rendered, target : Tensor [H, W, 3]
-        In [0, 1].
-    mask : Tensor [H, W] bool, optional
-        False = ignore this pixel.
-    target_mean : Tensor [H, W, 3], optional
-        ``blur(target)``, to save time. Changes no bit of the result.
-    expected : (float, float, float)
-        Expected cotangents of the three values; others cost a second pass.
-    library : Library, optional
-        Default: :func:`ready_library`.
-
-    Returns
-    -------
-    l1, ssim, l2 : Tensor []
-        Means over valid pixels and channels; 0 if no pixel is valid. L2 is the mean squared difference.
-
-    Raises
-    ------
-    ShapeError
-        If shapes differ, or a tensor has another dtype or device than the library.
-    """
-    library = library or ready_library()
-    shapes = {"target": (target, "H W 3"), "rendered": (rendered, "H W 3")}
-    if target_mean is not None:
-        shapes["target_mean"] = (target_mean, "H W 3")
-    if mask is not None:
-        shapes["mask"] = (mask, "H W")
-    check_shapes(shapes)
-    _, target, target_mean = library.arrays(rendered=rendered, target=target, target_mean=target_mean)
-    wanted = needs_gradient(rendered)
-    arguments = (target, _mask_bytes(mask), target_mean, expected, wanted, library)
-    l1, ssim, l2 = _Photometric.apply(rendered.contiguous(), *arguments)
-    return l1, ssim, l2
-
-
 class _NormalConsistency(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -248,43 +122,6 @@ def _as_expected(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
     return tuple(None if g is None else g * (cotangent / ctx.expected) for g in gradients)
 
 
-def normal_consistency(
-    normal: Tensor,
-    depth: Tensor,
-    alpha: Tensor,
-    how: NormalOptions,
-    *,
-    expected: float = 0.05,
-    library: Library | None = None,
-) -> Tensor:
-    """Return the normal consistency loss [], the native form of the functions in ``losses.formulas``.
-
-    Parameters
-    ----------
-    normal : Tensor [H, W, 3]
-        sum w n, world frame.
-    depth : Tensor [H, W] world units
-        0 where nothing was hit.
-    alpha : Tensor [H, W]
-    how : NormalOptions
-    expected : float
-        Expected cotangent; another one costs a multiplication of the gradients.
-    library : Library, optional
-
-    Raises
-    ------
-    ShapeError
-        If shapes differ, or a tensor has another dtype or device than the library.
-    """
-    library = library or ready_library()
-    how.check(normal, depth, alpha)
-    *_, weights = library.arrays(normal=normal, depth=depth, alpha=alpha, weights=how.weights)
-    images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
-    how = replace(how, mask=_mask_bytes(how.mask), weights=weights)
-    value: Tensor = _NormalConsistency.apply(*images, how, expected, needs_gradient(normal, depth, alpha), library)
-    return value
-
-
 class _NormalSmoothness(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -311,51 +148,6 @@ class _NormalSmoothness(torch.autograd.Function):
         return (_as_expected(ctx, cotangent)[0], *[None] * 6)
 
 
-def check_smoothness(normal: Tensor, alpha: Tensor, flatness: Tensor, mask: Tensor | None) -> None:
-    """Raise ShapeError if the inputs of ``normal_smoothness`` do not fit together."""
-    shapes = {"normal": (normal, "H W 3"), "alpha": (alpha, "H W"), "flatness": (flatness, "H W")}
-    check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
-    if flatness.dtype != torch.uint8 or flatness.device != normal.device:
-        raise ShapeError(f"flatness must be uint8 on {normal.device}, got {flatness.dtype} on {flatness.device}")
-
-
-def normal_smoothness(
-    normal: Tensor,
-    alpha: Tensor,
-    flatness: Tensor,
-    mask: Tensor | None = None,
-    *,
-    expected: float = 1.0,
-    library: Library | None = None,
-) -> Tensor:
-    """Return the native form of ``losses.formulas.normal_smoothness``.
-
-    Parameters
-    ----------
-    normal : Tensor [H, W, 3]
-        sum w n, world frame.
-    alpha : Tensor [H, W]
-        A constant.
-    flatness : Tensor [H, W] uint8
-    mask : Tensor [H, W] bool, optional
-        False = ignore this pixel.
-    expected : float
-        Expected cotangent; another one costs a multiplication of the gradient.
-    library : Library, optional
-
-    Raises
-    ------
-    ShapeError
-        If shapes differ, or a tensor has another dtype or device than the library.
-    """
-    library = library or ready_library()
-    check_smoothness(normal, alpha, flatness, mask)
-    _, alpha = library.arrays(normal=normal, alpha=alpha)
-    given = (normal.contiguous(), alpha.detach(), flatness.contiguous(), _mask_bytes(mask))
-    value: Tensor = _NormalSmoothness.apply(*given, expected, needs_gradient(normal), library)
-    return value
-
-
 class _MaskedMean(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, mask: Tensor | None, library: Library) -> Tensor:
@@ -372,13 +164,32 @@ class _MaskedMean(torch.autograd.Function):
         return ctx.mask.to(cotangent.dtype) * (cotangent / max(int(ctx.mask.sum()), 1)), None, None
 
 
-def masked_mean(values: Tensor, mask: Tensor | None = None, *, library: Library | None = None) -> Tensor:
-    """Return the mean [] of a map [H, W] over the pixels where ``mask`` is True, 0 if there are none.
+class NativeLosses(LossOperations):
+    """The losses of a native library.
 
-    The summation order is fixed.
+    Parameters
+    ----------
+    library : Library, optional
+        Default: :func:`ready_library`.
     """
-    library = library or ready_library()
-    check_shapes({"values": (values, "H W")} | ({"mask": (mask, "H W")} if mask is not None else {}))
-    library.arrays(values=values)
-    mean: Tensor = _MaskedMean.apply(values.contiguous(), _mask_bytes(mask), library)
-    return mean
+
+    functions = (_Photometric, _NormalConsistency, _NormalSmoothness, _MaskedMean)
+
+    def __init__(self, library: Library | None = None) -> None:
+        super().__init__(library or ready_library())
+
+    @property
+    def blur(self) -> Callable[[Tensor], Tensor]:
+        """Filters an image [H, W, 3] with the SSIM window (11x11 Gaussian, sigma 1.5, zero outside), no gradient."""
+        return self._blur
+
+    def _ready(self, **tensors: Tensor | None) -> list[Any]:
+        found: list[Any] = self._engine.arrays(**tensors)
+        return found
+
+    def _blur(self, image: Tensor) -> Tensor:
+        sizes = check_shapes({"image": (image, "H W 3")})
+        (source,) = self._ready(image=image)
+        out = torch.empty_like(source)
+        _call(self._engine, "gs2d_blur", source, sizes["H"], sizes["W"], out)
+        return out

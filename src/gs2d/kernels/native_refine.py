@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.core.camera import Camera
+from gs2d.kernels.c_structures import filled, structure
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
@@ -18,7 +19,6 @@ __all__ = [
     "WARPED",
     "GatherArguments",
     "MatchArguments",
-    "RasterArguments",
     "draw_on_cpu",
     "gather_on_cpu",
     "lens_of",
@@ -27,43 +27,7 @@ __all__ = [
 
 PLANES = 7  # images in the workspace of a comparison
 WARPED, VISIBLE = 0, 2  # of them: the neighbour as the view sees it, and where (1 or 0)
-
-
-class RasterArguments(ctypes.Structure):
-    """``RasterArguments`` of cpu/refine.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("vertices", "faces", "width", "height")),
-        ("lens", ctypes.c_double * 4),
-        ("pose", ctypes.c_double * 12),
-        ("near", ctypes.c_double),
-        *((name, ctypes.c_void_p) for name in ("positions", "corners", "flat", "face", "depth")),
-    )
-
-
-class MatchArguments(ctypes.Structure):
-    """``MatchArguments`` of cpu/refine.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("width", "height", "source_width", "source_height", "radius")),
-        *((name, ctypes.c_double * 4) for name in ("lens", "source_lens")),
-        ("motion", ctypes.c_double * 12),
-        *((name, ctypes.c_double) for name in ("texture", "poor", "good", "occluded")),
-        *((name, ctypes.c_void_p) for name in ("grey", "source", "usable", "source_usable")),
-        *((name, ctypes.c_void_p) for name in ("depth", "source_depth", "planes", "gradient", "curvature", "sums")),
-    )
-
-
-class GatherArguments(ctypes.Structure):
-    """``GatherArguments`` of cpu/refine.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("width", "height")),
-        ("lens", ctypes.c_double * 4),
-        ("grazing", ctypes.c_double),
-        *((name, ctypes.c_void_p) for name in ("local", "normals", "corners", "face", "gradient", "curvature")),
-        *((name, ctypes.c_void_p) for name in ("by_vertex", "bend_by_vertex")),
-    )
+MatchArguments, GatherArguments = (structure(name, "cpu/refine.cpp") for name in ("MatchArguments", "GatherArguments"))
 
 
 def lens_of(camera: Camera) -> ctypes.Array[ctypes.c_double]:
@@ -89,30 +53,21 @@ def draw_on_cpu(
     size = (camera.height, camera.width)
     flat = np.empty_like(vertices)
     face, depth = np.empty(size, np.int32), np.empty(size, f"f{library.dtype.itemsize}")
-    arguments = RasterArguments(
-        vertices=len(vertices),
-        faces=len(faces),
-        width=camera.width,
-        height=camera.height,
-        lens=lens_of(camera),
-        pose=(ctypes.c_double * 12)(*camera.T_cam_world[:3].ravel()),
-        near=near,
-        positions=vertices.ctypes.data,
-        corners=faces.ctypes.data,
-        flat=flat.ctypes.data,
-        face=face.ctypes.data,
-        depth=depth.ctypes.data,
-    )
+    arrays = {"positions": vertices, "corners": faces, "flat": flat, "face": face, "depth": depth}
+    sizes = {"vertices": len(vertices), "faces": len(faces), "width": camera.width, "height": camera.height}
+    pose = tuple(camera.T_cam_world[:3].ravel())
+    kind = structure("RasterArguments", "cpu/refine.cpp")
+    arguments = filled(kind, **arrays, **sizes, lens=lens_of(camera), pose=pose, near=near)
     library.function("gs2d_raster_mesh", None, [ctypes.c_void_p])(ctypes.byref(arguments))
     return face, depth
 
 
-def gather_on_cpu(library: Library, arguments: GatherArguments) -> None:
+def gather_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
     """Add derivatives by pixel depth to the vertices."""
     library.function("gs2d_gather_vertices", None, [ctypes.c_void_p])(ctypes.byref(arguments))
 
 
-def match_on_cpu(library: Library, arguments: MatchArguments) -> None:
+def match_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
     """Add the derivatives of one comparison to the pixels.
 
     Raises

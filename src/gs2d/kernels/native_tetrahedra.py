@@ -7,44 +7,12 @@ import ctypes
 import numpy as np
 
 from gs2d.errors import ProtocolError
+from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import Library
 
 __all__ = ["minimum_cut_on_cpu", "tetrahedra_on_cpu", "votes_on_cpu"]
 
 ROWS_A_POINT = 9  # tetrahedra; samples of a surface have six to seven
-
-
-class TetrahedraArguments(ctypes.Structure):
-    """``TetrahedraArguments`` of cpu/tetrahedra.cpp."""
-
-    _fields_ = (
-        ("points", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("xyz", "order")),
-        ("capacity", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("corners", "neighbours", "inserted")),
-        ("count", ctypes.c_int64),
-    )
-
-
-class VoteArguments(ctypes.Structure):
-    """``VoteArguments`` of cpu/visibility_votes.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("lines", "surfaces")),
-        *((name, ctypes.c_void_p) for name in ("xyz", "corners", "neighbours", "mirror", "first")),
-        *((name, ctypes.c_void_p) for name in ("ends", "starts", "sigma", "weight")),
-        *((name, ctypes.c_void_p) for name in ("facets", "full", "cameras")),
-    )
-
-
-class CutArguments(ctypes.Structure):
-    """``CutArguments`` of cpu/minimum_cut.cpp."""
-
-    _fields_ = (
-        ("nodes", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("neighbours", "mirror", "capacity", "terminal", "source_side")),
-        ("flow", ctypes.c_int64),
-    )
 
 
 def tetrahedra_on_cpu(library: Library, grid: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,15 +26,9 @@ def tetrahedra_on_cpu(library: Library, grid: np.ndarray, order: np.ndarray) -> 
         capacity = count * len(grid) + 1000
         corners, neighbours = np.empty((capacity, 4), np.int32), np.empty((capacity, 4), np.int32)
         inserted = np.zeros(len(grid), np.uint8)
-        arguments = TetrahedraArguments(
-            points=len(grid),
-            xyz=grid.ctypes.data,
-            order=order.ctypes.data,
-            capacity=capacity,
-            corners=corners.ctypes.data,
-            neighbours=neighbours.ctypes.data,
-            inserted=inserted.ctypes.data,
-        )
+        arrays = {"xyz": grid, "order": order, "corners": corners, "neighbours": neighbours, "inserted": inserted}
+        kind = structure("TetrahedraArguments", "cpu/tetrahedra.cpp")
+        arguments = filled(kind, **arrays, points=len(grid), capacity=capacity)
         library.function("gs2d_tetrahedra", None, [ctypes.c_void_p])(ctypes.byref(arguments))
         if arguments.count >= 0:
             break
@@ -84,8 +46,8 @@ def votes_on_cpu(library: Library, arrays: dict[str, np.ndarray], surfaces: int)
     ``arrays`` has the names and types of the fields of ``VoteArguments``; ``facets``, ``full`` and ``cameras`` change
     in place.
     """
-    addresses = {name: array.ctypes.data for name, array in arrays.items()}
-    arguments = VoteArguments(lines=len(arrays["ends"]), surfaces=surfaces, **addresses)
+    kind = structure("VoteArguments", "cpu/visibility_votes.cpp")
+    arguments = filled(kind, lines=len(arrays["ends"]), surfaces=surfaces, **arrays)
     library.function("gs2d_votes", None, [ctypes.c_void_p])(ctypes.byref(arguments))
 
 
@@ -94,14 +56,9 @@ def minimum_cut_on_cpu(
 ) -> tuple[np.ndarray, int]:
     """Return the source side [N] bool and the flow; ``capacity`` and ``terminal`` become what is left."""
     side = np.zeros(len(neighbours), np.uint8)
-    arguments = CutArguments(
-        nodes=len(neighbours),
-        neighbours=neighbours.ctypes.data,
-        mirror=mirror.ctypes.data,
-        capacity=capacity.ctypes.data,
-        terminal=terminal.ctypes.data,
-        source_side=side.ctypes.data,
-    )
+    arrays = {"neighbours": neighbours, "mirror": mirror, "capacity": capacity, "terminal": terminal}
+    kind = structure("CutArguments", "cpu/minimum_cut.cpp")
+    arguments = filled(kind, **arrays, source_side=side, nodes=len(neighbours))
     library.function("gs2d_minimum_cut", None, [ctypes.c_void_p])(ctypes.byref(arguments))
     if arguments.flow < 0:
         raise ProtocolError("the minimum cut needs more memory than there is; a lower --memory makes fewer points")

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import library_for
 
 __all__ = ["BestPlanes", "sweep_planes"]
@@ -33,17 +34,6 @@ class BestPlanes:
     plane: Tensor
     before: Tensor
     after: Tensor
-
-
-class _SweepArguments(ctypes.Structure):
-    """``SweepArguments`` of cpu/sweep.cpp, with float32 arrays."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("height", "width", "planes", "neighbours", "radius")),
-        *((name, ctypes.c_void_p) for name in ("image", "wanted", "others", "sizes", "turned", "moved", "depths")),
-        ("noise", ctypes.c_float),
-        *((name, ctypes.c_void_p) for name in ("best", "plane", "before", "after")),
-    )
 
 
 def sweep_planes(
@@ -79,15 +69,16 @@ def sweep_planes(
         return None
     height, width = image.shape
     images = [F.pad(tensor[None], (0, 1, 0, 1), mode="replicate")[0].contiguous() for tensor in others]
-    inputs = [tensor.contiguous() for tensor in (image, wanted.to(torch.uint8), turned, moved, depths)]
+    inputs = {"image": image, "wanted": wanted.to(torch.uint8), "turned": turned, "moved": moved, "depths": depths}
+    inputs = {name: tensor.contiguous() for name, tensor in inputs.items()}
     sizes = torch.tensor([list(tensor.shape) for tensor in others], dtype=torch.int64)
     addresses = torch.tensor([tensor.data_ptr() for tensor in images], dtype=torch.int64)
     best, before, after = (torch.full((height, width), -1.0) for _ in range(3))
     plane = torch.zeros(height, width, dtype=torch.int32)
-    at = dict(zip(("image", "wanted", "turned", "moved", "depths"), (t.data_ptr() for t in inputs), strict=True))
-    at |= {"best": best.data_ptr(), "plane": plane.data_ptr(), "before": before.data_ptr(), "after": after.data_ptr()}
+    outputs = {"best": best, "plane": plane, "before": before, "after": after}
     counts = {"height": height, "width": width, "planes": len(depths), "neighbours": len(images), "radius": radius}
-    arguments = _SweepArguments(**counts, **at, others=addresses.data_ptr(), sizes=sizes.data_ptr(), noise=noise)
+    kind = structure("SweepArguments", "cpu/sweep.cpp")
+    arguments = filled(kind, **counts, **inputs, **outputs, others=addresses, sizes=sizes, noise=noise)
     if not library.function("gs2d_sweep", ctypes.c_int, [ctypes.c_void_p])(ctypes.byref(arguments)):
         raise MemoryError("no memory for a plane sweep")
     return BestPlanes(best, plane.long(), before, after)

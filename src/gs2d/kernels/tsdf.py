@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels.cuda.kernel_arguments import THREADS, structure
+from gs2d.kernels.c_structures import filled, structure
+from gs2d.kernels.cuda.kernel_arguments import THREADS
 
 if TYPE_CHECKING:
     import torch
@@ -68,17 +69,10 @@ def mark_on_cpu(
         Includes a border of one block on all sides; changed in place.
     """
     rays, depth, offsets = (np.ascontiguousarray(a, np.float64) for a in (rays, depth, offsets))
-    arguments = structure("MarkArguments")(
-        count=len(depth),
-        steps=len(offsets),
-        rays=rays.ctypes.data,
-        depth=depth.ctypes.data,
-        offsets=offsets.ctypes.data,
-        start=(ctypes.c_double * 3)(*start),
-        end=(ctypes.c_double * 3)(*end),
-        padded=(ctypes.c_int64 * 3)(*marks.shape),
-        marks=marks.ctypes.data,
-    )
+    arrays = {"rays": rays, "depth": depth, "offsets": offsets, "marks": marks}
+    grid = {"start": tuple(start), "end": tuple(end), "padded": marks.shape}
+    kind = structure("MarkArguments", "core/fuse.h")
+    arguments = filled(kind, **arrays, **grid, count=len(depth), steps=len(offsets))
     library.function("gs2d_mark_blocks", None, [ctypes.c_void_p])(ctypes.byref(arguments))
 
 
@@ -92,19 +86,15 @@ def arguments_of(
     """
     rows = arrays["rows"]
     assert rows is not None
-    arguments = structure("FuseArguments")(blocks=len(rows), height=size[0], width=size[1], truncation=truncation)
     for name, array in arrays.items():
         if array is None:
             continue
         wanted = "int64" if name == "rows" else "float32"
-        if isinstance(array, np.ndarray):
-            contiguous, address = array.flags.c_contiguous, array.ctypes.data
-        else:
-            contiguous, address = array.is_contiguous(), array.data_ptr()
+        contiguous = array.flags.c_contiguous if isinstance(array, np.ndarray) else array.is_contiguous()
         if not contiguous or str(array.dtype).removeprefix("torch.") != wanted:
             raise ShapeError(f"{name} must be contiguous {wanted} for the fusion kernels, got {array.dtype}")
-        setattr(arguments, name, address)
-    return arguments
+    sizes = {"blocks": len(rows), "height": size[0], "width": size[1]}
+    return filled(structure("FuseArguments", "core/fuse.h"), **arrays, **sizes, truncation=truncation)
 
 
 def fuse_on_cpu(library: Library, arguments: ctypes.Structure) -> None:

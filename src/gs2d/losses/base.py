@@ -24,7 +24,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError, ShapeError
-from gs2d.kernels.native_losses import LossOperations
+from gs2d.kernels.loss_operations import LossOperations
 from gs2d.losses import formulas
 from gs2d.losses.formulas import normals_from_depth
 from gs2d.render.backends import Backend, get_backend

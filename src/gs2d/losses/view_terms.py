@@ -16,7 +16,7 @@ from gs2d.config.loss_registry import register_loss
 from gs2d.config.recipe import LossTerm
 from gs2d.config.validate import one_of, require
 from gs2d.errors import RecipeError
-from gs2d.kernels.native_losses import LossOperations, NormalOptions
+from gs2d.kernels.loss_operations import LossOperations, NormalOptions
 from gs2d.losses import formulas
 from gs2d.losses.base import Loss, LossView
 from gs2d.losses.formulas import EDGES

@@ -11,9 +11,9 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
-from gs2d.kernels import densify_stats, library, native_adam, native_losses
+from gs2d.kernels import densify_stats, library, native_adam
 from gs2d.kernels.native_adam import AdamUpdate
-from gs2d.kernels.native_losses import LossOperations
+from gs2d.kernels.native_losses import NativeLosses
 from gs2d.render import cpu_cached
 from gs2d.render.backends import Backend, BackendStatus, register_backend
 from gs2d.render.cpu_cached import CachedView
@@ -79,15 +79,9 @@ class CpuBackend(Backend):
         """Cache a view in which only the colours of ``rows`` change; None if it exceeds ``limit_bytes``."""
         return cpu_cached.cache_view(splats, camera, settings, rows, limit_bytes=limit_bytes)
 
-    def loss_operations(self, device: torch.device) -> LossOperations:
+    def loss_operations(self, device: torch.device) -> NativeLosses:
         """Return the fused operations for the losses."""
-        return LossOperations(
-            native_losses.photometric,
-            native_losses.normal_consistency,
-            native_losses.normal_smoothness,
-            native_losses.masked_mean,
-            native_losses.blur,
-        )
+        return NativeLosses()
 
     def adam_step(self, updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:
         """Run one Adam step on several attributes in one call."""

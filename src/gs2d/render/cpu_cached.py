@@ -19,6 +19,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
+from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import Library, ready_library
 from gs2d.render.native_rasterizer import (
     ParameterGradients,
@@ -33,19 +34,6 @@ from gs2d.render.types import RasterSettings
 __all__ = ["CachedView", "cache_view"]
 
 TILE, SH_MAX = 16, 16  # px per side of a tile; basis functions of degree 3 (kernels/core/sh.h)
-ARRAYS = (
-    *("tile_entries", "tile_blocks", "entry_row", "entry_blocks", "row_begin", "row_entries"),
-    *("weights", "frozen", "basis"),
-)
-
-
-class _CachedView(ctypes.Structure):
-    """``struct CachedView`` of kernels/cpu/cached.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("width", "height", "tiles_x", "tiles", "rows", "degree")),
-        *((name, ctypes.c_void_p) for name in ARRAYS),
-    )
 
 
 class CachedView:
@@ -66,9 +54,9 @@ class CachedView:
         self.library = library
         self.height, self.width = size
         self.rows, self.arrays = rows, arrays
-        tiles_x = -(-self.width // TILE)
-        numbers = (self.width, self.height, tiles_x, len(arrays["tile_entries"]) - 1, rows, degree)
-        self._native = _CachedView(*numbers, *(address_of(arrays[name]) for name in ARRAYS))
+        sizes = {"width": self.width, "height": self.height, "tiles_x": -(-self.width // TILE)}
+        sizes |= {"tiles": len(arrays["tile_entries"]) - 1, "rows": rows, "degree": degree}
+        self._native = filled(structure("CachedView", "cpu/cached.cpp"), **sizes, **arrays)
 
     @property
     def nbytes(self) -> int:
@@ -113,7 +101,7 @@ class CachedView:
         sh0_gradient = torch.empty(self.rows, 1, 3, dtype=shN.dtype)
         shN_gradient = torch.empty_like(shN)
         slots = torch.empty(len(self.arrays["entry_row"]), 4, dtype=shN.dtype)
-        out = ParameterGradients(sh0=address_of(sh0_gradient), shN=address_of(shN_gradient))
+        out = filled(ParameterGradients, sh0=sh0_gradient, shN=shN_gradient)
         types = [*[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_void_p] * 2]
         gradients = self.library.function("gs2d_cached_gradients", None, types)
         given = (address_of(upstream), address_of(colors), shN.shape[1], address_of(slots))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from typing import Any, Self, TypeVar
 
 import torch
@@ -12,9 +12,9 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels import torch_kernels
-from gs2d.kernels.cuda import cuda_adam, cuda_losses, diagnose, launch
+from gs2d.kernels.cuda import cuda_adam, diagnose, launch
+from gs2d.kernels.cuda.cuda_losses import CudaLosses
 from gs2d.kernels.native_adam import AdamUpdate
-from gs2d.kernels.native_losses import LossOperations
 from gs2d.kernels.tsdf import FusionOnDevice
 from gs2d.render.backends import Backend, register_backend
 from gs2d.render.cuda_rasterizer import CudaChoices, rasterize_with, splat_errors_with
@@ -94,15 +94,9 @@ class CudaBackend(Backend):
         launcher = launch.launcher_for(splats.device)
         return splat_errors_with(launcher, splats, camera, image, settings, mask, occlusion)
 
-    def loss_operations(self, device: torch.device) -> LossOperations:
+    def loss_operations(self, device: torch.device) -> CudaLosses:
         """Return the fused operations for the losses; caching the local mean of a target would save no time."""
-        launcher = launch.launcher_for(device)
-        return LossOperations(
-            partial(cuda_losses.photometric, launcher=launcher),
-            partial(cuda_losses.normal_consistency, launcher=launcher),
-            partial(cuda_losses.normal_smoothness, launcher=launcher),
-            partial(cuda_losses.masked_mean, launcher=launcher),
-        )
+        return CudaLosses(launch.launcher_for(device))
 
     def fusion(self) -> FusionOnDevice:
         """Return what fuses depth maps into volumes."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, IMAGES
 from gs2d.errors import BackendError
-from gs2d.kernels.cuda.kernel_arguments import fill, structure, work_of
+from gs2d.kernels.cuda.kernel_arguments import cuda_structure, fill, work_of
 from gs2d.kernels.cuda.launch import Launcher, Work
 from gs2d.render.cuda_works import (
     blend,
@@ -74,7 +74,8 @@ class ForwardState:
 
     Attributes
     ----------
-    view : structure "View"
+    view : ctypes.Structure
+        ``View`` of common.h.
     records : Tensor [N, 16] float32
         Screen records; undefined for splats without tiles.
     tile_counts : Tensor [N] int32
@@ -126,7 +127,7 @@ def view_of(camera: Camera, settings: RasterSettings) -> ctypes.Structure:
         raise BackendError(
             f"the cuda backend needs lowpass_depth 'center', got {settings.lowpass_depth!r}; use --backend reference"
         )
-    view = structure("View")()
+    view = cuda_structure("View")()
     view.camera.R[:] = np.asarray(camera.rotation).ravel().tolist()
     view.camera.t[:] = np.asarray(camera.T_cam_world[:3, 3]).tolist()
     view.camera.center[:] = np.asarray(camera.center).tolist()
@@ -223,7 +224,7 @@ def _features(
     values: Tensor, background: Tensor, images: Tensor, upstream: Tensor | None = None, gradients: Tensor | None = None
 ) -> ctypes.Structure:
     """Return the structure of further channels; their number is a multiple of ``CHANNELS``, tensors are contiguous."""
-    features = structure("Features")(count=values.shape[1])
+    features = cuda_structure("Features")(count=values.shape[1])
     fill(features, values=values, background=background, images=images, upstream=upstream, gradients=gradients)
     return features
 

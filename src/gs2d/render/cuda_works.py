@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from torch import Tensor
 
-from gs2d.kernels.cuda.kernel_arguments import THREADS, structure, work_of
+from gs2d.kernels.cuda.kernel_arguments import THREADS, cuda_structure, work_of
 from gs2d.kernels.cuda.launch import Work
 
 __all__ = [
@@ -47,7 +47,7 @@ def blocks_of(count: int) -> int:
 
 def takes_view(work: Work) -> bool:
     """Whether a launch takes a view or parts of one."""
-    return hasattr(work.arguments, "view") or isinstance(work.arguments, structure("EmitArguments"))
+    return hasattr(work.arguments, "view") or isinstance(work.arguments, cuda_structure("EmitArguments"))
 
 
 def see(works: Iterable[Work], view: ctypes.Structure) -> None:
@@ -87,7 +87,7 @@ def piece_words(room: int) -> int:
 def piece_buffers(memory: Tensor, words: int) -> ctypes.Structure:
     """Return the structure of the pieces: their states, then their table, in ``words`` as from :func:`piece_words`."""
     capacity, start = words // (PIECE_STATE + PIECE_ROW), memory.data_ptr()
-    return structure("Pieces")(capacity, start + memory.element_size() * PIECE_STATE * capacity, start)
+    return cuda_structure("Pieces")(capacity, start + memory.element_size() * PIECE_STATE * capacity, start)
 
 
 def order_tiles(tiles: int, pointers: Pointers, pieces: ctypes.Structure) -> Work:
@@ -128,12 +128,12 @@ def blend_gradients(
         Gradients of the images by name; absent or None: no gradient.
     sums : mapping
         "gradients", "extras", "slots" and "learns"; without "gradients", only colour gradients are computed.
-    pieces : structure "Pieces"
-        Pieces of the forward pass, none if there are further channels.
+    pieces : ctypes.Structure
+        ``Pieces`` of pixels.h, of the forward pass; none if there are further channels.
     absolute : bool
         Whether to gather the absolute densification signal.
-    features : structure "Features", optional
-        Further channels.
+    features : ctypes.Structure, optional
+        ``Features`` of pixels.h: further channels.
     """
     blocks = tiles + int(pieces.capacity)
     if sums.get("gradients") is None:

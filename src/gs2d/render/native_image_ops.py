@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
+from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import Library
 
 __all__ = ["Wrench", "expose", "expose_vjp", "wrench"]
@@ -22,38 +23,6 @@ __all__ = ["Wrench", "expose", "expose_vjp", "wrench"]
 POINTER = ctypes.c_void_p
 Wrench = tuple[Tensor, Tensor]
 """Derivatives [3] by a translation and by a rotation of the scene about the camera centre, world axes, float64."""
-
-
-class _ExposureImage(ctypes.Structure):
-    """``struct Picture`` of kernels/cpu/exposure.cpp."""
-
-    _fields_ = (
-        ("color", POINTER),
-        ("coverage", POINTER),
-        ("pixels", ctypes.c_int64),
-        ("transform", ctypes.c_double * 12),
-        ("background", ctypes.c_double * 3),
-    )
-
-
-class _MovedScene(ctypes.Structure):
-    """``struct Moved`` of kernels/cpu/camera.cpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        *((name, POINTER) for name in ("points", "to_points", "quats", "to_quats", "shN", "to_sh0")),
-        ("sh_rest", ctypes.c_int64),
-        ("degree", ctypes.c_int64),
-        ("center", ctypes.c_double * 3),
-    )
-
-
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None else tensor.data_ptr()
-
-
-def _background(background: Tensor | None) -> Any:
-    return (ctypes.c_double * 3)(*([0.0] * 3 if background is None else background.tolist()))
 
 
 def _sums(library: Library, name: str, count: int, *arguments: Any) -> Tensor:
@@ -65,9 +34,13 @@ def _sums(library: Library, name: str, count: int, *arguments: Any) -> Tensor:
 
 
 def _exposure_image(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> Any:
-    numbers = (ctypes.c_double * 12)(*transform.detach().flatten().tolist())
-    behind = _background(None if coverage is None else background)
-    return _ExposureImage(color.data_ptr(), _address(coverage), color.numel() // 3, numbers, behind)
+    picture = filled(
+        structure("Picture", "cpu/exposure.cpp"), color=color, coverage=coverage, pixels=color.numel() // 3
+    )
+    picture.transform = tuple(transform.detach().flatten().tolist())
+    if coverage is not None and background is not None:
+        picture.background = tuple(background.tolist())
+    return picture
 
 
 def expose(
@@ -129,8 +102,7 @@ def wrench(
     if degree > 0 and (degree + 1) ** 2 - 1 > sizes["K"]:
         raise ShapeError(f"shN must hold degree {degree}, got {sizes['K']} coefficients")
     tensors = dict(zip(shapes, library.arrays(**{name: tensor for name, (tensor, _) in shapes.items()}), strict=True))
-    pointers = {name: tensor.data_ptr() for name, tensor in tensors.items()}
-    moved = _MovedScene(count=sizes["N"], sh_rest=sizes.get("K", 0), degree=degree, **pointers)
-    moved.center[:] = center.tolist()
+    rows = {"count": sizes["N"], "sh_rest": sizes.get("K", 0), "degree": degree}
+    moved = filled(structure("Moved", "cpu/camera.cpp"), **rows, **tensors, center=tuple(center.tolist()))
     force, torque = _sums(library, "gs2d_camera_wrench", 6, ctypes.byref(moved)).view(2, 3)
     return force, torque

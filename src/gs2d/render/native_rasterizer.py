@@ -17,8 +17,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.core.camera import Camera
-from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
+from gs2d.core.splats import IMAGES, Splats
 from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.c_structures import structure
 from gs2d.kernels.library import Library
 from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
@@ -36,55 +37,12 @@ __all__ = [
 CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "clamp_px", "mip_px")
 
 
-class _View(ctypes.Structure):
-    """``struct View`` of kernels/cpu/frame.h."""
-
-    _fields_ = (
-        ("R", ctypes.c_double * 9),
-        ("t", ctypes.c_double * 3),
-        ("center", ctypes.c_double * 3),
-        *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
-        *((name, ctypes.c_double) for name in CONSTANTS),
-        ("background", ctypes.c_double * 3),
-        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks", "near_plane_policy")),
-    )
-
-
+_View, _Parameters, _Images, _ImageGradients, ParameterGradients, _Features = (
+    structure(name, "cpu/frame.h")
+    for name in ("View", "Parameters", "Images", "ImageGradients", "ParameterGradients", "Features")
+)
 VIEW_LAYOUT = struct.Struct(f"{ctypes.sizeof(_View) // 8 - 3}d5i4x")
 _constants = attrgetter(*CONSTANTS)
-
-
-class _Parameters(ctypes.Structure):
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        ("sh_rest", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ATTRIBUTES),
-    )
-
-
-class _Images(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in (*IMAGES, "radii"))
-
-
-class _ImageGradients(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in (*IMAGES, "depth_transmittance"))
-
-
-class ParameterGradients(ctypes.Structure):
-    """``struct ParameterGradients`` of kernels/cpu/frame.h: addresses to fill; null is not computed."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in (*ATTRIBUTES, "probe")),
-        ("probe_columns", ctypes.c_int64),
-        ("rows", ctypes.c_void_p),
-    )
-
-
-class _Features(ctypes.Structure):
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("values", "background", "color", "upstream", "gradients")),
-    )
 
 
 class _Frame:
@@ -98,7 +56,7 @@ class _Frame:
         self._release(self.pointer)
 
 
-def view_of(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
+def view_of(camera: Camera, settings: RasterSettings, exact_masks: bool) -> ctypes.Structure:
     """Return the structure of a view; BackendError for what only the reference backend supports."""
     if settings.lowpass_depth != "center":
         raise BackendError(
@@ -132,7 +90,7 @@ def _plain(tensor: Tensor | None, dtype: torch.dtype) -> Tensor | None:
     return tensor.detach().to(dtype).contiguous()
 
 
-def parameters_of(tensors: Sequence[Tensor]) -> _Parameters:
+def parameters_of(tensors: Sequence[Tensor]) -> ctypes.Structure:
     """Return the structure of the six tensors of a ``Splats``."""
     means, *_, shN = tensors
     return _Parameters(means.shape[0], shN.shape[1], *(address_of(t) for t in tensors))
@@ -161,7 +119,7 @@ def check_tensors(splats: Splats, settings: RasterSettings, dtype: torch.dtype) 
 
 
 def render_forward(
-    library: Library, view: _View, tensors: Sequence[Tensor], depth_width: float | None = None
+    library: Library, view: ctypes.Structure, tensors: Sequence[Tensor], depth_width: float | None = None
 ) -> tuple[dict[str, Tensor], Tensor, _Frame]:
     """Return images, radii and the state for the backward pass; the tensors are contiguous."""
     H, W = int(view.height), int(view.width)
@@ -199,7 +157,7 @@ class _NativeOptions(NamedTuple):
     """Arguments of _NativeRasterize without gradients."""
 
     library: Library
-    view: _View
+    view: ctypes.Structure
     depth_width: float | None  # None: no depth by transmittance
     rows: Tensor | None  # splats with gradients; None: all
     background: Tensor | None  # behind further channels

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import emulate
-from gs2d.kernels.cuda import cuda_losses as ops
-from gs2d.kernels.native_losses import NormalOptions
+from gs2d.kernels.cuda.cuda_losses import CudaLosses
+from gs2d.kernels.loss_operations import NormalOptions
 from gs2d.losses import formulas as reference
 from loss_images import geometry, photographs, relative_error, wide_camera
 
@@ -26,7 +26,7 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
     x.requires_grad_()
     valid = mask if masked else None
     exact = x.detach().double().requires_grad_()
-    values = ops.photometric(x, y, valid, launcher=emulator)
+    values = CudaLosses(emulator).photometric(x, y, valid)
     exact_values = [value(exact, y.double(), valid) for value in (reference.l1, reference.ssim, reference.l2)]
     for value, exact_value, atol in zip(values, exact_values, (1e-6, 2e-6, 1e-6), strict=True):
         assert value.item() == pytest.approx(exact_value.item(), abs=atol)
@@ -41,11 +41,11 @@ def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emul
     x, y, _ = photographs(7, 6, dtype=torch.float32)
     nothing = torch.zeros(7, 6, dtype=torch.bool)
     x.requires_grad_()
-    l1, ssim, l2 = ops.photometric(x, y, nothing, launcher=emulator)
+    l1, ssim, l2 = CudaLosses(emulator).photometric(x, y, nothing)
     normal, depth, alpha, _ = geometry(7, 6, dtype=torch.float32)
-    mean = ops.masked_mean(x[..., 0], nothing, launcher=emulator)
+    mean = CudaLosses(emulator).masked_mean(x[..., 0], nothing)
     seen = NormalOptions(wide_camera(7, 6), nothing)
-    consistency = ops.normal_consistency(normal, depth, alpha, seen, launcher=emulator)
+    consistency = CudaLosses(emulator).normal_consistency(normal, depth, alpha, seen)
     assert [l1.item(), ssim.item(), l2.item(), mean.item(), consistency.item()] == [0.0] * 5
     (gradient,) = torch.autograd.grad(l1 + ssim + l2 + mean, x)
     assert not gradient.any()
@@ -71,7 +71,7 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     found_in = [image.requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in images]
     how = NormalOptions(camera, valid, weights, edges == "camera", per_splat)
-    value = ops.normal_consistency(*found_in, how, launcher=emulator)
+    value = CudaLosses(emulator).normal_consistency(*found_in, how)
     function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
     exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
@@ -96,7 +96,7 @@ def test_normal_smoothness_and_its_gradient_are_those_of_the_reference(
     given = (alpha, flatness, mask if masked else None)
     normal.requires_grad_()
     exact_normal = normal.detach().double().requires_grad_()
-    value = ops.normal_smoothness(normal, *given, launcher=emulator)
+    value = CudaLosses(emulator).normal_smoothness(normal, *given)
     exact = reference.normal_smoothness(exact_normal, *given)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
     (found,) = torch.autograd.grad(value, normal, torch.tensor(0.8))
@@ -115,7 +115,7 @@ def test_the_mean_of_a_map_and_its_gradient_are_those_of_the_reference(
     )
     values.requires_grad_()
     exact = values.detach().double().requires_grad_()
-    found = ops.masked_mean(values, mask if masked else None, launcher=emulator)
+    found = CudaLosses(emulator).masked_mean(values, mask if masked else None)
     expected = reference.masked_mean(exact, mask if masked else None)
     assert found.item() == pytest.approx(expected.item(), abs=1e-7)
     (gradient,) = torch.autograd.grad(found, values, torch.tensor(3.0))
@@ -134,10 +134,10 @@ def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: em
         replace(emulator, seed=2),
     ):
         z, depth = x.clone().requires_grad_(), images[1].clone().requires_grad_()
-        values = ops.photometric(z, y, mask, launcher=launcher)
+        values = CudaLosses(launcher).photometric(z, y, mask)
         seen = NormalOptions(wide_camera(37, 44), mask)
-        consistency = ops.normal_consistency(images[0], depth, images[2], seen, launcher=launcher)
-        mean = ops.masked_mean(x[..., 0], mask, launcher=launcher)
+        consistency = CudaLosses(launcher).normal_consistency(images[0], depth, images[2], seen)
+        mean = CudaLosses(launcher).masked_mean(x[..., 0], mask)
         results.append((*values, consistency, mean, *torch.autograd.grad(sum(values) + consistency, (z, depth))))
     for others in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))

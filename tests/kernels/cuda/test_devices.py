@@ -39,7 +39,7 @@ def fill(structure, **tensors):
             assert tensor.is_contiguous(), name
             pointers[0] += 1
 
-for module in (adam, arguments, ops, cuda_passes, cuda_works):
+for module in (adam, arguments, cuda_passes):
     module.fill = fill
 launcher = SimpleNamespace(launch=lambda name, *rest: launched.add(name))
 
@@ -94,7 +94,7 @@ print(sorted(devices), sorted(launched), pointers[0])
 
 GRADIENTS = """
 import numpy as np
-from gs2d.kernels.native_losses import NormalOptions
+from gs2d.kernels.loss_operations import NormalOptions
 from render_scenes import front_camera
 from gs2d.render.types import RasterSettings
 
@@ -128,10 +128,10 @@ with FakeTensorMode():
             there_and_back(cuda._CudaRasterize, needs, options, rand(9, columns), intrinsics, None, *splats)
         there_and_back(cuda._CudaRasterize, (*[False] * 8, True, True), options, None, None, None, *splats)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
-    there_and_back(ops._CudaPhotometric, (True,), image, rand(24, 40, 3), mask, True, launcher)
+    there_and_back(ops._CudaPhotometric, (True,), image, rand(24, 40, 3), mask, None, None, True, launcher)
     for form, weights in ((False, None), (True, plane)):
         how = NormalOptions(camera, mask, weights, form, form)
-        there_and_back(ops._CudaNormalConsistency, (True, True, True), image, plane, plane, how, launcher)
+        there_and_back(ops._CudaNormalConsistency, (True, True, True), image, plane, plane, how, 1.0, True, launcher)
     there_and_back(ops._CudaMaskedMean, (True,), plane, mask, launcher)
     cuda_passes.errors(launcher, view, splats, image, mask)
     print(sorted(launched), pointers[0])

@@ -12,7 +12,7 @@ import pytest
 
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile
-from gs2d.kernels.cuda.kernel_arguments import structure
+from gs2d.kernels.cuda.kernel_arguments import cuda_structure
 
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)(<float>)? ')
 TEMPLATES = {"PinholeCamera": "PinholeCamera<float>"}
@@ -40,7 +40,7 @@ def test_kernels_and_python_agree_where_every_field_lies(name: str, monkeypatch:
     text = compile.sources()[name]
     kinds = {kind + arguments for _, kind, arguments in KERNEL.findall(text)}
     assert len(KERNEL.findall(text)) == len(compile.KERNEL.findall(text))
-    lines = [line for kind in sorted(kinds) for line in assertions(kind, structure(kind.partition("<")[0]))]
+    lines = [line for kind in sorted(kinds) for line in assertions(kind, cuda_structure(kind.partition("<")[0]))]
     assert len(lines) > 3
     headers = {key: value for key, value in compile.sources().items() if key.endswith(".h")}
     # only the structures: no need to recompile the kernels

@@ -11,7 +11,7 @@
 
 namespace gs2d {
 
-// Mirrored by a ctypes structure in render/cpu_cached.py; change both. `row`: index among the trained splats.
+// `row`: index among the trained splats.
 struct CachedView {
     int64_t width, height, tiles_x, tiles, rows, degree;
     int64_t *tile_entries, *tile_blocks;  // [tiles + 1]: first entry and first weight block of each tile
