@@ -20,7 +20,7 @@ import torch
 
 from benchmarks.timing import machine
 from gs2d.kernels.cuda import diagnose, launch
-from gs2d.kernels.cuda.launch import Launcher, OneByOne
+from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.backends import BACKENDS, Backend, get_backend
 from gs2d.render.cuda_backend import CudaBackend
 
@@ -153,7 +153,7 @@ class _Clock:
 
 
 @dataclass(eq=False)
-class RecordingLauncher(OneByOne):
+class RecordingLauncher(Launcher):
     """Launcher that records the kernel names and forwards to another launcher."""
 
     inner: Launcher
@@ -165,7 +165,7 @@ class RecordingLauncher(OneByOne):
 
 
 @dataclass(eq=False)
-class TimingLauncher(OneByOne):
+class TimingLauncher(Launcher):
     """Launcher that times every launch of another launcher by kernel."""
 
     inner: Launcher

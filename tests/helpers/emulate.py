@@ -21,7 +21,7 @@ import pytest
 
 import gs2d.kernels
 from gs2d.core.locks import try_lock
-from gs2d.kernels.cuda.launch import OneByOne
+from gs2d.kernels.cuda.launch import Launcher
 
 HERE = Path(__file__).parent
 KERNELS = Path(gs2d.kernels.__file__).parent
@@ -145,7 +145,7 @@ def forget_old() -> None:
 
 
 @dataclass(frozen=True)
-class Emulator(OneByOne):
+class Emulator(Launcher):
     """A launcher (``gs2d.kernels.cuda.launch``) that runs the package's kernels on tensors in host memory.
 
     Each source file is compiled when one of its kernels is first launched.

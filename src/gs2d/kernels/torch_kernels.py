@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,48 +18,20 @@ __all__ = ["accumulate", "adam_step", "finite", "first_not_finite"]
 @torch.no_grad()
 def adam_step(updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:
     """Run one Adam step on several attributes, in place, by torch's fused Adam; untrained rows are not written."""
+    options: dict[str, Any] = {"fused": True, "amsgrad": False, "maximize": False, "weight_decay": 0.0}
+    options |= {"beta1": beta1, "beta2": beta2, "eps": eps}
     for update in updates:
         whole = (update.parameter, update.mean, update.square)
         rows = update.rows if update.trained is None else update.trained.nonzero().squeeze(1)  # [M]
-        if rows is None:
-            _adam(update, *whole, update.gradient, beta1, beta2, eps)
+        if rows is not None and len(rows) == 0:
             continue
-        if len(rows) == 0:
-            continue
-        parts = (update.parameter[rows], update.mean[rows], update.square[rows])
-        _adam(update, *parts, update.gradient if update.compact else update.gradient[rows], beta1, beta2, eps)
-        for tensor, part in zip(whole, parts, strict=True):
-            tensor[rows] = part
-
-
-def _adam(
-    update: AdamUpdate,
-    parameter: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    gradient: Tensor,
-    beta1: float,
-    beta2: float,
-    eps: float,
-) -> None:
-    """Apply Adam with bias correction, in place."""
-    step = torch.tensor(float(update.step - 1), device=parameter.device)  # adam() adds one
-    adam(
-        [parameter],
-        [gradient.contiguous()],
-        [mean],
-        [square],
-        [],
-        [step],
-        fused=True,
-        amsgrad=False,
-        beta1=beta1,
-        beta2=beta2,
-        lr=update.rate,
-        weight_decay=0.0,
-        eps=eps,
-        maximize=False,
-    )
+        parameter, mean, square = whole if rows is None else (tensor[rows] for tensor in whole)
+        gradient = update.gradient if rows is None or update.compact else update.gradient[rows]
+        step = torch.tensor(float(update.step - 1), device=parameter.device)  # adam() adds one
+        adam([parameter], [gradient.contiguous()], [mean], [square], [], [step], lr=update.rate, **options)
+        if rows is not None:
+            for tensor, part in zip(whole, (parameter, mean, square), strict=True):
+                tensor[rows] = part
 
 
 @torch.no_grad()

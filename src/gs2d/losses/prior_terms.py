@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,35 +13,41 @@ from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
-from gs2d.losses.base import Loss, LossView
+from gs2d.losses.base import SETTINGS, Loss, LossView
 from gs2d.losses.known_maps import Priors
-from gs2d.losses.prior_formulas import depth_prior, normal_prior
+from gs2d.losses.prior_formulas import Depths, NormalTarget, depth_prior, normal_prior
 from gs2d.render.types import RenderOutput
 
 
-def _index(view: LossView) -> int:
-    if view.index is None:
-        raise RecipeError("losses on known depths and normals need the index of the training view, got none")
-    return view.index
+class _PriorLoss(Loss):
+    """A loss on known values, whose settings are a field of the recipe."""
+
+    settings: str
+    _priors: Priors
+    _prior: DepthPrior | NormalPrior
+
+    def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
+        """Plan how known values are read; raise DataError if the capture has none of the requested kind."""
+        self._prior = getattr(recipe, self.settings)
+        others: dict[str, Any] = {name: None for name in SETTINGS if name != self.settings}
+        self._priors = Priors(scene, replace(recipe, **others), device=device)
+
+    def known(self, output: RenderOutput, view: LossView) -> tuple[Depths | None, NormalTarget | None]:
+        """Return the known depths and normals of a view."""
+        if view.index is None:
+            raise RecipeError("losses on known depths and normals need the index of the training view, got none")
+        return self._priors.at(view.index, output.color.dtype)
 
 
 @register_loss("depth_prior")
-class DepthPriorLoss(Loss):
+class DepthPriorLoss(_PriorLoss):
     """Relative error of known depths (docs/math.md, "Priors")."""
 
     settings = "depth_prior"
-    _priors: Priors
-    _prior: DepthPrior
-
-    def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
-        """Plan how known depths are read; raise DataError if the capture has none of the requested kind."""
-        assert recipe.depth_prior is not None
-        self._prior = recipe.depth_prior
-        self._priors = Priors(scene, replace(recipe, normal_prior=None), device=device)
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
         """Return the loss []; None for a view without known depths."""
-        known = self._priors.at(_index(view), output.color.dtype)[0]
+        known = self.known(output, view)[0]
         if known is None:
             return None
         loss = depth_prior(known, output.depth(view.depth_kind), output.alpha, view.mask)
@@ -48,22 +55,14 @@ class DepthPriorLoss(Loss):
 
 
 @register_loss("normal_prior")
-class NormalPriorLoss(Loss):
+class NormalPriorLoss(_PriorLoss):
     """1 - cosine of rendered and known normals (docs/math.md, "Priors")."""
 
     settings = "normal_prior"
-    _priors: Priors
-    _prior: NormalPrior
-
-    def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
-        """Plan how known normals are read; raise DataError if the capture has none."""
-        assert recipe.normal_prior is not None
-        self._prior = recipe.normal_prior
-        self._priors = Priors(scene, replace(recipe, depth_prior=None), device=device)
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
         """Return the loss []; None for a view without known normals."""
-        known = self._priors.at(_index(view), output.color.dtype)[1]
+        known = self.known(output, view)[1]
         if known is None:
             return None
         return self._prior.weight_at(view.run_iteration) * normal_prior(known, output.normal, output.alpha, view.mask)

@@ -6,7 +6,7 @@ The reference forms are the formulas of ``losses.formulas``. Definitions: ``docs
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -33,8 +33,12 @@ class _ColorLoss(Loss):
     """L1, SSIM and L2 have one fused pass, which returns all three."""
 
     only_color = True
-    field: str
-    index: int
+    field: str  # of a whole step
+    index: int  # in the values of the fused pass
+    formula: Callable[[Tensor, Tensor, Tensor | None], Tensor]
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return self.formula(output.color, view.target, view.mask)
 
     def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
         """Return this one of the three values."""
@@ -56,20 +60,17 @@ class _ColorLoss(Loss):
 class L1(_ColorLoss):
     """Mean absolute difference of colours."""
 
-    field, index = "l1", 0
-
-    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
-        return formulas.l1(output.color, view.target, view.mask)
+    field, index, formula = "l1", 0, staticmethod(formulas.l1)
 
 
 @register_loss("ssim")
 class StructuralSimilarity(_ColorLoss):
     """1 - SSIM."""
 
-    field, index = "ssim", 1
+    field, index, formula = "ssim", 1, staticmethod(formulas.ssim)
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
-        return 1 - formulas.ssim(output.color, view.target, view.mask)
+        return 1 - super().__call__(output, view)
 
     def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
         """Return 1 - SSIM of the fused pass."""
@@ -80,10 +81,7 @@ class StructuralSimilarity(_ColorLoss):
 class L2(_ColorLoss):
     """Mean squared difference of colours."""
 
-    field, index = "l2", 2
-
-    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
-        return formulas.l2(output.color, view.target, view.mask)
+    field, index, formula = "l2", 2, staticmethod(formulas.l2)
 
 
 def _normals(output: RenderOutput, view: LossView) -> Tensor:

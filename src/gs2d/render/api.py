@@ -194,11 +194,6 @@ def rasterize_features(
         With ``sh_degree`` -1 and without depth by transmittance.
     features : Features
     backend : Backend
-
-    Raises
-    ------
-    ShapeError, BackendError
-        As for :func:`rasterize`.
     """
     _check_types(splats, camera, settings, screen_probe=screen_probe)
     settings, camera = _checked_view(splats, camera, settings, backend, screen_probe)

@@ -151,11 +151,6 @@ def cache_view(
     -------
     CachedView or None
         None if it exceeds ``limit_bytes``; its size depends only on the arguments.
-
-    Raises
-    ------
-    ShapeError, BackendError
-        As for :func:`gs2d.render.native_rasterizer.rasterize`.
     """
     library = library or ready_library()
     check_tensors(splats, settings, library.dtype)

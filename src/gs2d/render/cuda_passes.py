@@ -18,14 +18,13 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, IMAGES
 from gs2d.errors import BackendError
+from gs2d.kernels.c_structures import filled
 from gs2d.kernels.cuda.kernel_arguments import cuda_structure, fill, work_of
 from gs2d.kernels.cuda.launch import Launcher, Work
 from gs2d.render.cuda_works import (
     blend,
     blend_gradients,
     blocks_of,
-    emit,
-    find_ranges,
     order_tiles,
     piece_buffers,
     piece_words,
@@ -224,9 +223,8 @@ def _features(
     values: Tensor, background: Tensor, images: Tensor, upstream: Tensor | None = None, gradients: Tensor | None = None
 ) -> ctypes.Structure:
     """Return the structure of further channels; their number is a multiple of ``CHANNELS``, tensors are contiguous."""
-    features = cuda_structure("Features")(count=values.shape[1])
-    fill(features, values=values, background=background, images=images, upstream=upstream, gradients=gradients)
-    return features
+    tensors = {"values": values, "background": background, "images": images}
+    return filled(cuda_structure("Features"), **tensors, upstream=upstream, gradients=gradients, count=values.shape[1])
 
 
 def blend_features(launcher: Launcher, frame: ForwardState, values: Tensor, background: Tensor) -> Tensor:
@@ -268,10 +266,12 @@ def _bin(
         payloads = torch.empty(candidates, dtype=torch.int32, device=device)
         given = {name: projected[name] for name in ("cull", "records", "rects")}
         given |= {"order": order, "ends": ends, "keys": keys, "payloads": payloads}
-        _run(launcher, view, emit(f"emit_entries_{bits}", candidates, len(order), given, exact=exact))
+        sizes = {"candidates": candidates, "visible": len(order), "exact": int(exact)}
+        _run(launcher, view, work_of(f"emit_entries_{bits}", blocks_of(candidates), given, sizes))
         sorted_keys, permutation = torch.sort(keys, stable=True)
         given = {"keys": sorted_keys, "permutation": permutation, "payloads": payloads}
-        _run(launcher, view, find_ranges(bits, candidates, given | {"entries": entries, "ranges": ranges}))
+        given |= {"entries": entries, "ranges": ranges}
+        _run(launcher, view, work_of(f"find_ranges_{bits}", blocks_of(candidates), given, candidates=candidates))
     heavy_first = torch.empty(tiles, dtype=torch.int32, device=device)
     words = piece_words(0 if whole_lists else candidates)
     pieces = torch.empty(words, dtype=torch.float32, device=device)

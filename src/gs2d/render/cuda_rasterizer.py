@@ -7,7 +7,7 @@ the launcher of the tests runs the same sources on the CPU. Memory, sorts and th
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -76,12 +76,10 @@ class _CudaOptions:
 
     launcher: Launcher
     view: ctypes.Structure
-    exact_masks: bool
     distortion: bool
     transmittance: bool
-    deterministic: bool
+    choices: CudaChoices
     learns: Tensor | None
-    budget: PairBudget | None
     background: Tensor | None  # behind further channels
 
 
@@ -110,12 +108,12 @@ class _CudaRasterize(torch.autograd.Function):
         tensors = [p.detach().contiguous() for p in parameters]
         launcher, view = options.launcher, options.view
         choices = {
-            "exact": options.exact_masks,
+            "exact": options.choices.exact_masks,
             "distortion": options.distortion,
             "transmittance": options.transmittance,
             "whole_lists": values is not None,
         }
-        frame = forward(launcher, view, tensors, **choices, budget=options.budget)
+        frame = forward(launcher, view, tensors, **choices, budget=options.choices.budget)
         features, color = None, frame.images["color"]
         if values is not None and options.background is not None:
             count = values.shape[1]
@@ -161,7 +159,7 @@ class _CudaRasterize(torch.autograd.Function):
         probe = torch.empty(ctx.probe_shape, dtype=torch.float32, device=device) if want_probe else None
         each = torch.zeros(len(tensors[0]), 4, dtype=torch.float32, device=device) if want_intrinsics else None
         wanted = RequestedGradients(
-            {**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic
+            {**gradients, "probe": probe, "intrinsics": each}, options.learns, bool(options.choices.deterministic)
         )
         by_name = {"depth_transmittance": None} | dict(zip(_image_names(options.transmittance), given, strict=True))
         to_values = torch.zeros_like(values) if want_values or of_features is not None else None
@@ -214,16 +212,15 @@ def rasterize_with(
     _check_tensors(splats, settings)
     if gradient_rows is not None:
         gradient_rows = gradient_rows.clone()  # it may change before the backward pass
-    deterministic = choices.deterministic
-    if deterministic is None:
-        deterministic = torch.are_deterministic_algorithms_enabled()
+    if choices.deterministic is None:
+        choices = replace(choices, deterministic=torch.are_deterministic_algorithms_enabled())
     transmittance = settings.with_transmittance_depth
-    chosen = (choices.exact_masks, settings.with_distortion, transmittance, deterministic)
+    chosen = (settings.with_distortion, transmittance, choices)
     values = background = None
     if features is not None:
         values, background = features.values, features.background.detach()
         background = pad(background, (0, -len(background) % CHANNELS))
-    options = _CudaOptions(launcher, _view(camera, settings), *chosen, gradient_rows, choices.budget, background)
+    options = _CudaOptions(launcher, _view(camera, settings), *chosen, gradient_rows, background)
     learning = (screen_probe, camera.intrinsics, values)
     radii, *images = _CudaRasterize.apply(options, *learning, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(_image_names(transmittance), images, strict=True)), radii=radii)
@@ -249,11 +246,6 @@ def splat_errors_with(
         False = ignore this pixel.
     occlusion : bool
         Count a pixel only until it has stopped. An error above 1e9 within 8x8 pixels counts as 1e9.
-
-    Raises
-    ------
-    ShapeError, BackendError
-        As for :func:`rasterize_with`.
     """
     _check_tensors(splats, settings)
     parameters = [t.detach().contiguous() for _, t in splats.items()]

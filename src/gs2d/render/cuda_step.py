@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.kernels.cuda.cuda_adam import adam_work
 from gs2d.kernels.cuda.cuda_losses import MEAN_PIXELS, NORMAL_H, NORMAL_W, strips
 from gs2d.kernels.cuda.kernel_arguments import fill, work_of
 from gs2d.kernels.cuda.launch import Launcher, Work
@@ -30,14 +31,12 @@ from gs2d.kernels.cuda.sort import (
     passes_of,
     pieces_of,
 )
-from gs2d.kernels.native_adam import bias_corrections
+from gs2d.kernels.native_adam import AdamUpdate, bias_corrections
 from gs2d.render.cuda_passes import MAX_SPLATS, PROJECTED, view_of
 from gs2d.render.cuda_works import (
     blend,
     blend_gradients,
     blocks_of,
-    emit,
-    find_ranges,
     order_tiles,
     piece_buffers,
     piece_words,
@@ -52,7 +51,6 @@ from gs2d.render.whole_step import WholeStep
 __all__ = ["Arena", "Stepper"]
 
 SPARE = 1.2  # allocated memory relative to the need, so that a few more splats or pairs fit
-ADAM_ELEMENTS = 512  # per block, adam.cu
 DEPTH_BITS = 32
 TICKETS = 16  # counters; each pass of both sorts and the running sums take one
 MOST_VIEWS = 1 << 12
@@ -221,7 +219,7 @@ class _Sorting:
     def __init__(self, arena: Arena, count: int, tiles: int, room: int) -> None:
         self._arena, self._count, self._tiles = arena, count, tiles
         self.bits = 16 if tiles < 1 << 15 else 32
-        self._passes = passes_of(tiles.bit_length())  # keys 0 .. tiles; the last one marks unused pairs
+        self._passes = len(passes_of(tiles.bit_length()))
         key = torch.int16 if self.bits == 16 else torch.int32
         entries = arena.get("entries", room, torch.int32)
         self.most_room = len(entries)
@@ -229,7 +227,7 @@ class _Sorting:
         payloads = [arena.get("payloads", self.most_room, torch.int32, spare=1), entries]
         self._keys, self._payloads = keys, payloads
         self.keys, self.payloads = keys[0], payloads[0]
-        last = len(self._passes) % 2
+        last = self._passes % 2
         self.tile_keys, self.entries = keys[last], payloads[last]
         self.ends = arena.get("ends", count, torch.int32)
         self._scratch()
@@ -245,7 +243,7 @@ class _Sorting:
             self._parts[name] = at
             at += words
         self._parts["tile_words"] = at  # last, since its size depends on the room
-        most = at + len(self._passes) * pieces_of(self.most_room) * DIGITS
+        most = at + self._passes * pieces_of(self.most_room) * DIGITS
         self._words = self._arena.get("scratch", most, torch.int32)
 
     def part(self, name: str, words: int = 0) -> int:
@@ -257,29 +255,39 @@ class _Sorting:
         self._clearing = work_of("clear_words", 1, threads=SORT_THREADS, words=self.part("tickets"))
         return self._clearing
 
+    def _sort(
+        self, name: str, width: int, bits: int, keys: list[Tensor], payloads: list[Tensor], tickets: int
+    ) -> list[Work]:
+        """Return the launches of a sort by the lowest ``bits`` bits, which alternate between two buffers."""
+        plan, digits = passes_of(bits), f"{name}_digits"
+        counting = {"passes": len(plan), "keys": keys[0], "digits": self.part(digits)}
+        works = [work_of(f"count_digits_{width}", 1, counting, threads=SORT_THREADS)]
+        for number, (shift, of_digit) in enumerate(plan):
+            source, target = number % 2, (number + 1) % 2
+            buffers = {"keys": keys[source], "payloads": payloads[source]}
+            buffers |= {"sorted_keys": keys[target], "sorted_payloads": payloads[target]}
+            scratch = {"digits": self.part(digits, number * DIGITS), "ticket": self.part("tickets", tickets + number)}
+            digit = {"shift": shift, "bits": of_digit}
+            works.append(work_of(f"sort_pass_{width}", 1, buffers, scratch, digit, threads=SORT_THREADS))
+        return works
+
+    def _set_count(self, name: str, works: list[Work], count: int) -> None:
+        """Write the number of keys into the launches of a sort."""
+        first, *passes = works
+        first.arguments.count, first.blocks = count, digit_blocks(count)
+        for number, work in enumerate(passes):
+            work.arguments.count, work.blocks = count, pieces_of(count)
+            work.arguments.words = self.part(f"{name}_words", number * pieces_of(count) * DIGITS)
+
     def by_depth(self, depth_keys: Tensor) -> list[Work]:
-        """Sort splats by depth; keys alternate between two buffers, and the last pass does not write them."""
+        """Sort splats by depth; the first pass numbers them, and the last one does not write the keys."""
         n, arena = self._count, self._arena
         keys = [depth_keys, arena.get("more_depth_keys", n, torch.int32)]
         orders = [arena.get("order", n, torch.int32), arena.get("more_order", n, torch.int32)]
-        counting = {"count": n, "passes": MOST_PASSES, "keys": keys[0], "digits": self.part("depth_digits")}
-        works = [work_of("count_digits_32", digit_blocks(n), counting, threads=SORT_THREADS)]
-        plan = passes_of(DEPTH_BITS)
-        for number, (shift, bits) in enumerate(plan):
-            source, target = number % 2, (number + 1) % 2
-            one = work_of("sort_pass_32", pieces_of(n), threads=SORT_THREADS, count=n, shift=shift, bits=bits)
-            fill(
-                one.arguments,
-                keys=keys[source],
-                payloads=None if number == 0 else orders[source],
-                sorted_keys=None if number == len(plan) - 1 else keys[target],
-                sorted_payloads=orders[target],
-                digits=self.part("depth_digits", number * DIGITS),
-                ticket=self.part("tickets", number),
-                words=self.part("depth_words", number * pieces_of(n) * DIGITS),
-            )
-            works.append(one)
-        self.order = orders[len(plan) % 2]
+        works = self._sort("depth", 32, DEPTH_BITS, keys, orders, 0)
+        works[1].arguments.payloads = works[-1].arguments.sorted_keys = None
+        self._set_count("depth", works, n)
+        self.order = orders[len(passes_of(DEPTH_BITS)) % 2]
         return works
 
     def running(self, tile_counts: Tensor, overflow: Tensor) -> Work:
@@ -292,30 +300,16 @@ class _Sorting:
 
     def by_tile(self) -> list[Work]:
         """Sort pairs by tile."""
-        keys, payloads = self._keys, self._payloads
-        counting = {"passes": len(self._passes), "keys": keys[0], "digits": self.part("tile_digits")}
-        self._by_tile = [work_of(f"count_digits_{self.bits}", 1, counting, threads=SORT_THREADS)]
-        for number, (shift, bits) in enumerate(self._passes):
-            source, target = number % 2, (number + 1) % 2
-            one = work_of(f"sort_pass_{self.bits}", 1, threads=SORT_THREADS, shift=shift, bits=bits)
-            fill(one.arguments, keys=keys[source], payloads=payloads[source])
-            fill(one.arguments, sorted_keys=keys[target], sorted_payloads=payloads[target])
-            one.arguments.digits = self.part("tile_digits", number * DIGITS)
-            one.arguments.ticket = self.part("tickets", MOST_PASSES + number)
-            self._by_tile.append(one)
+        bits = self._tiles.bit_length()  # keys 0 .. tiles; the last one marks unused pairs
+        self._by_tile = self._sort("tile", self.bits, bits, self._keys, self._payloads, MOST_PASSES)
         return self._by_tile
 
     def set(self, room: int, pairs: Tensor) -> None:
         """Write the room for pairs and the address of their count."""
-        pieces = pieces_of(room)
-        words = self._parts["tile_words"] + len(self._passes) * pieces * DIGITS
+        words = self._parts["tile_words"] + self._passes * pieces_of(room) * DIGITS
         self._clearing.arguments.count, self._clearing.blocks = words // 4, clear_blocks(words // 4)
         fill(self._running.arguments, room=room, pairs=pairs)
-        first, *passes = self._by_tile
-        first.arguments.count, first.blocks = room, digit_blocks(room)
-        for number, work in enumerate(passes):
-            work.arguments.count, work.blocks = room, pieces
-            work.arguments.words = self.part("tile_words", number * pieces * DIGITS)
+        self._set_count("tile", self._by_tile, room)
 
 
 class _Losses:
@@ -394,35 +388,6 @@ class _Losses:
             fill(self._silhouette, mask=mask, object=photograph, scale=scale)
 
 
-class _Adam:
-    """The launch of Adam."""
-
-    def __init__(self, step: WholeStep, gradients: Mapping[str, Tensor], overflow: Tensor) -> None:
-        beta1, beta2, eps = step.betas
-        self.work = work_of("adam_step", 0, weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps, skip=overflow)
-        arguments, blocks = self.work.arguments, 0
-        self._slots: dict[str, ctypes.Structure] = {}
-        for name, parameter in step.splats.items():
-            one = step.learned.get(name)
-            if one is None or parameter.numel() == 0:
-                continue
-            slot = arguments.attributes[arguments.count]
-            fill(slot, parameter=parameter, mean=one.mean, square=one.square)
-            fill(slot, gradient=gradients[name], trained=one.trained)
-            slot.elements, slot.first_block, slot.columns = parameter.numel(), blocks, math.prod(parameter.shape[1:])
-            self._slots[name] = slot
-            arguments.count += 1
-            blocks += -(-parameter.numel() // ADAM_ELEMENTS)
-        self.work.blocks = blocks
-
-    def set(self, step: WholeStep) -> None:
-        """Write the learning rates."""
-        beta1, beta2, _ = step.betas
-        for name, slot in self._slots.items():
-            one = step.learned[name]
-            slot.step_size, slot.root_2 = bias_corrections(one.rate, one.step, beta1, beta2)
-
-
 class _Plan:
     """The launches of an iteration in order, in two parts: up to the count of pairs, and after it."""
 
@@ -439,8 +404,8 @@ class _Plan:
         pointers |= {name: getattr(sorting, name) for name in ("order", "ends", "keys", "payloads")}
         ranges, heavy_first = sorting.part("ranges"), arena.get("tiles", tiles, torch.int32)
         self._of_room = [
-            emit(f"emit_sorted_{sorting.bits}", room, count, pointers),
-            find_ranges(sorting.bits, room, {"keys": sorting.tile_keys, "ranges": ranges}),
+            work_of(f"emit_sorted_{sorting.bits}", 1, pointers, visible=count, exact=1),
+            work_of(f"find_ranges_{sorting.bits}", 1, keys=sorting.tile_keys, ranges=ranges),
         ]
         seen = arena.get("seen", 8 * ((sorting.most_room >> 5) + tiles + 1), torch.int32)
         lists: dict[str, Tensor | int | None] = {
@@ -476,8 +441,13 @@ class _Plan:
             gathered = last.arguments.gathered
             fill(gathered, **{field: step.gathered.get(name) for field, name in names.items()})
             fill(gathered, radii=projected["radii"], skip=self.overflow)
-        self._adam = _Adam(step, gradients, self.overflow)
-        self.afterwards += [blended, last, self._adam.work]
+        beta1, beta2, eps = step.betas
+        self._learned = [name for name, tensor in splats.items() if name in step.learned and tensor.numel() > 0]
+        updates = [
+            AdamUpdate(splats[name], gradient=gradients[name], **step.learned[name]._asdict()) for name in self._learned
+        ]
+        self._adam = adam_work(updates, beta1=beta1, beta2=beta2, eps=eps, skip=self.overflow)
+        self.afterwards += [blended, last, self._adam]
         self._seeing = [work for work in (*self.until_known, *self.afterwards) if takes_view(work)]
 
     @property
@@ -492,7 +462,10 @@ class _Plan:
             work.arguments.candidates, work.blocks = room, blocks_of(room)
         self._sorting.set(room, pairs)
         self._losses.set(step, view)
-        self._adam.set(step)
+        beta1, beta2, _ = step.betas
+        for slot, name in zip(self._adam.arguments.attributes, self._learned, strict=False):
+            one = step.learned[name]
+            slot.step_size, slot.root_2 = bias_corrections(one.rate, one.step, beta1, beta2)
 
 
 def _only_colors(step: WholeStep) -> bool:

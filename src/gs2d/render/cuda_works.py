@@ -20,8 +20,6 @@ __all__ = [
     "blend",
     "blend_gradients",
     "blocks_of",
-    "emit",
-    "find_ranges",
     "order_tiles",
     "piece_buffers",
     "piece_words",
@@ -67,16 +65,6 @@ def project(
     count = len(splats["means"])
     options = {"count": count, "sh_rest": splats["shN"].shape[1], "errors": int(errors), "exact": int(exact)}
     return work_of("project_splats", blocks_of(count), splats, projected, options)
-
-
-def emit(kernel: str, room: int, visible: int, pointers: Pointers, *, exact: bool = True) -> Work:
-    """Emit the pairs of splat and tile."""
-    return work_of(kernel, blocks_of(room), pointers, candidates=room, visible=visible, exact=int(exact))
-
-
-def find_ranges(bits: int, room: int, pointers: Pointers) -> Work:
-    """Find each tile's range in the sorted pairs, whose keys have ``bits`` bits."""
-    return work_of(f"find_ranges_{bits}", blocks_of(room), pointers, candidates=room)
 
 
 def piece_words(room: int) -> int:

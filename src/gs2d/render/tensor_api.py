@@ -261,7 +261,10 @@ def _render(
         )
     behind = _backgrounds(backgrounds, count, channels, means)
     backend = backend if isinstance(backend, Backend) else get_backend(backend, means.device.type)
-    shape = (_LogScales.apply(scales[:, :2]), _Logits.apply(opacities))
+    with torch.no_grad():
+        sizes, covers = scales[:, :2].clamp(min=MIN_SCALE), opacities.clamp(MIN_OPACITY, MAX_OPACITY)
+        logs, logits, slopes = sizes.log(), torch.logit(covers), covers * (1 - covers)
+    shape = (_Parameter.apply(scales[:, :2], logs, sizes), _Parameter.apply(opacities, logits, slopes))
     per_camera = colors.dim() == (3 if sh_degree is None else 4)
     views = []
     for index, camera in enumerate(cameras):
@@ -365,36 +368,23 @@ def _backgrounds(backgrounds: Tensor | None, cameras: int, channels: int, like: 
     return backgrounds
 
 
-class _LogScales(torch.autograd.Function):
-    """Logarithm with a lower limit; a zero gradient stays zero at scale 0."""
+class _Parameter(torch.autograd.Function):
+    """The parameters of activated values within limits.
+
+    The gradient is divided by ``slope``, the derivative of the activation. Values beyond a limit have the gradient at
+    the limit, so that they can return; a zero gradient stays zero, also at scale 0.
+    """
 
     @staticmethod
-    def forward(ctx: Any, scales: Tensor) -> Tensor:
-        held = scales.clamp(min=MIN_SCALE)
-        ctx.save_for_backward(held)
-        return held.log()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        (held,) = ctx.saved_tensors
-        return torch.where(gradients[0] == 0, 0.0, gradients[0] / held)
-
-
-class _Logits(torch.autograd.Function):
-    """Logit with limits; values beyond a limit have the gradient at the limit, so that they can return."""
-
-    @staticmethod
-    def forward(ctx: Any, opacities: Tensor) -> Tensor:
-        held = opacities.clamp(MIN_OPACITY, MAX_OPACITY)
-        ctx.save_for_backward(held)
-        return torch.logit(held)
+    def forward(ctx: Any, activated: Tensor, parameters: Tensor, slope: Tensor) -> Tensor:
+        ctx.save_for_backward(slope)
+        return parameters.view_as(parameters)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        (held,) = ctx.saved_tensors
-        return torch.where(gradients[0] == 0, 0.0, gradients[0] / (held * (1 - held)))
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        (slope,) = ctx.saved_tensors
+        return torch.where(gradients[0] == 0, 0.0, gradients[0] / slope), None, None
 
 
 class _OverBackground(torch.autograd.Function):

@@ -121,7 +121,8 @@ with FakeTensorMode():
     view = cuda_passes.view_of(camera, RasterSettings())
     rows = torch.ones(9, dtype=torch.bool, device="cuda:0")
     for sure, transmittance in ((False, False), (True, False), (False, True), (True, True)):
-        options = cuda._CudaOptions(launcher, view, True, True, transmittance, sure, rows, budget, None)
+        choices = cuda.CudaChoices(deterministic=sure, budget=budget)
+        options = cuda._CudaOptions(launcher, view, True, transmittance, choices, rows, None)
         for columns in (2, 4):
             intrinsics = torch.rand(4)  # in the host's memory, where cameras are
             needs = (False, True, True, False, *[True] * 6)

@@ -178,11 +178,6 @@ def compile_text(
         As for :func:`compile_source`.
     headers : mapping of str to str
         Files that it may include, by name.
-
-    Raises
-    ------
-    BackendError
-        As for :func:`compile_source`.
     """
     nvrtc = _nvrtc()
     headers = {} if headers is None else headers
@@ -260,11 +255,6 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
         As for :func:`compile_source`.
     folder : Path, optional
         Instead of :func:`cache_folder`.
-
-    Raises
-    ------
-    BackendError
-        As for :func:`compile_source`.
     """
     stem = name.rpartition("/")[2].removesuffix(".cu")
     folder = folder or cache_folder()

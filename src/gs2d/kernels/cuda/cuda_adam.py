@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,15 +12,14 @@ from torch import Tensor
 
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.cuda_losses import ready
-from gs2d.kernels.cuda.kernel_arguments import arguments_of, fill
+from gs2d.kernels.cuda.kernel_arguments import fill, work_of
 from gs2d.kernels.native_adam import AdamUpdate, bias_corrections, check_update
 
 if TYPE_CHECKING:
-    from gs2d.kernels.cuda.launch import Launcher
+    from gs2d.kernels.cuda.launch import Launcher, Work
 
-__all__ = ["AdamUpdate", "adam_step"]
+__all__ = ["AdamUpdate", "adam_step", "adam_work"]
 
-THREADS = 128
 BLOCK_ELEMENTS = 512  # adam.cu
 
 
@@ -51,26 +51,33 @@ def adam_step(
     """
     if len(updates) > 6:
         raise ShapeError(f"adam_step takes up to 6 attributes, got {len(updates)}")
-    arguments = arguments_of("adam_step", weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps, skip=skip)
-    alive = []  # tensors behind the pointers
-    blocks = 0
+    plain = []  # keeps the tensors behind the pointers
     for update in updates:
         check_update(update)
-        tensors = {"parameter": update.parameter, "mean": update.mean, "square": update.square}
-        *_, gradient = ready(**tensors, gradient=update.gradient)
-        trained = None if update.trained is None else update.trained.contiguous()
-        rows = None if update.rows is None else update.rows.contiguous()
+        *_, gradient = ready(
+            parameter=update.parameter, mean=update.mean, square=update.square, gradient=update.gradient
+        )
+        masks = {name: getattr(update, name) for name in ("trained", "rows")}
+        masks = {name: None if tensor is None else tensor.contiguous() for name, tensor in masks.items()}
+        plain.append(replace(update, gradient=gradient, **masks))
+    work = adam_work(plain, beta1=beta1, beta2=beta2, eps=eps, skip=skip)
+    launcher.launch(work.name, work.blocks, work.threads, work.arguments)
+
+
+def adam_work(updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float, skip: Tensor | None) -> Work:
+    """Return the launch of an Adam step on contiguous tensors; it has a slot for each attribute with elements."""
+    work = work_of("adam_step", 0, weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps, skip=skip)
+    for update in updates:
         columns = math.prod(update.parameter.shape[1:])
-        elements = columns * (len(update.parameter) if rows is None else len(rows))
+        elements = columns * len(update.parameter if update.rows is None else update.rows)
         if elements == 0:
             continue
-        slot = arguments.attributes[arguments.count]
-        fill(slot, **tensors, gradient=gradient, trained=trained, rows=rows)
-        slot.elements, slot.first_block, slot.columns, slot.compact = elements, blocks, columns, int(update.compact)
+        slot = work.arguments.attributes[work.arguments.count]
+        names = ("parameter", "mean", "square", "gradient", "trained", "rows")
+        fill(slot, **{name: getattr(update, name) for name in names})
+        slot.elements, slot.first_block, slot.columns = elements, work.blocks, columns
+        slot.compact = int(update.compact)
         slot.step_size, slot.root_2 = bias_corrections(update.rate, update.step, beta1, beta2)
-        arguments.count += 1
-        blocks += -(-elements // BLOCK_ELEMENTS)
-        alive += [gradient, trained, rows]
-    if blocks > 0:
-        launcher.launch("adam_step", blocks, THREADS, arguments)
-    del alive
+        work.arguments.count += 1
+        work.blocks += -(-elements // BLOCK_ELEMENTS)
+    return work

@@ -22,7 +22,7 @@ from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda.driver import PER_THREAD, call, failure, load_driver, own_default_stream
 from gs2d.kernels.cuda.graph import Graph, Work
 
-__all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "launcher_for", "steps"]
+__all__ = ["GpuLauncher", "Launcher", "Work", "grow_in_place", "launcher_for", "steps"]
 
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
 STEP_VARIABLE, GRAPH, LAUNCHES = "GS2D_CUDA_STEP", "graph", "launches"
@@ -43,15 +43,8 @@ class Launcher(Protocol):
 
     def run(self, works: Sequence[Work]) -> None:
         """Queue kernels in order; a launcher may run repeated ones as a graph."""
-
-
-class OneByOne:
-    """Mixin of launchers that run works one by one."""
-
-    def run(self, works: Sequence[Work]) -> None:
-        """Launch each."""
         for work in works:
-            self.launch(work.name, work.blocks, work.threads, work.arguments)  # type: ignore[attr-defined]
+            self.launch(work.name, work.blocks, work.threads, work.arguments)
 
 
 def _stream_of(device: torch.device) -> int:
