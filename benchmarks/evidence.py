@@ -5,11 +5,11 @@
     python -m benchmarks.evidence DATA FOLDER [--scale 1] [--seed 0] [--captures lego bottle] [--recipes 2dgs ...]
         [--results FILE]
 
-DATA holds the captures. Runs use ``gs2d train ... --cache``, so the first 30,000 iterations are trained once. Finished
-runs are skipped and interrupted runs are resumed. Times are wall time in seconds, summed over all stages of a recipe,
-including cached ones. Figures are written to ``FOLDER/evidence.json`` and a table is printed. ``--results`` merges the
-rows into FILE, which can collect rows of several days. Each row records its commit and machine; check out the same
-commit before continuing.
+DATA holds the captures. Runs use ``gs2d train ... --set cache=DIR``, so the first 30,000 iterations are trained once.
+Finished runs are skipped and interrupted runs are resumed. Times are wall time in seconds, summed over all stages of
+a recipe, including cached ones. Figures are written to ``FOLDER/evidence.json`` and a table is printed. ``--results``
+merges the rows into FILE, which can collect rows of several days. Each row records its commit and machine; check out
+the same commit before continuing.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 ::
 
     python -m benchmarks.paper_tables --data CAPTURES --out runs/paper [--tables modules k] [--groups bottle-lego]
-        [--slots 2] [--seeds 3]
+        [--set slots=2] [--seeds 3]
 
 ``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d sweep` writes full pages with the paper's figures,
 the deviations and every command. This script prints a summary in the page's format: a table per capture, and which of
@@ -49,8 +49,8 @@ def make_table(table: str, group: Group, args: argparse.Namespace) -> str:
     """Run `gs2d sweep` and return its Markdown."""
     out = args.out / f"{group.name}-{table}"
     words = ["gs2d", "sweep", table, "--data", str(args.data), "--scenes", *group.scenes, "--out", str(out)]
-    words += ["--cache", str(args.out / "cache"), "--schedule-scale", SCALE, "--downscale", str(group.downscale)]
-    words += ["--seeds", str(args.seeds), *(["--slots", str(args.slots)] if args.slots else [])]
+    words += ["--set", f"cache={args.out / 'cache'}", "--schedule-scale", SCALE, "--downscale", str(group.downscale)]
+    words += ["--seeds", str(args.seeds), *(["--set", f"slots={args.slots}"] if args.slots else [])]
     execute(words)
     return (out / "table.md").read_text()
 

@@ -71,7 +71,7 @@ def train_command(case: Case, method: Method, data: str, out: Path, scale: float
     """Return the command of one run, as printed in the table."""
     words = ["gs2d", "train", f"{data}/{case.folder}", "--out", str(out / f"{case.name}-{method.name}-s{seed}")]
     words += ["--recipe", method.recipe, "--schedule-scale", str(scale), "--robust", "off"]  # not part of the paper
-    words += ["--cache", str(out / "cache"), "--seed", str(seed)]
+    words += ["--set", f"cache={out / 'cache'}", "--seed", str(seed)]
     for change in method.changes:
         words += ["--set", change]
     if case.downscale > 1:

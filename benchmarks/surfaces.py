@@ -127,7 +127,17 @@ def train(recipe: str, capture: Path, seed: int, args: argparse.Namespace) -> Pa
     if not ((folder / SPEC).exists() and read_json(folder / SPEC) == spec and (folder / PROCESS).exists()):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        command = [sys.executable, "-m", "gs2d", "train", str(capture), "--out", str(folder / RUN), "--no-page"]
+        command = [
+            sys.executable,
+            "-m",
+            "gs2d",
+            "train",
+            str(capture),
+            "--out",
+            str(folder / RUN),
+            "--set",
+            "page=false",
+        ]
         command += ["--recipe", recipe, "--schedule-scale", f"{args.scale:g}", "--seed", str(seed)]
         command += ["--threads", str(args.threads)] + [word for change in args.set for word in ("--set", change)]
         process = watch_process([*command, *shlex.split(args.train)], folder / CONSOLE)

@@ -17,5 +17,5 @@ done_=$(date +%s)
 echo "torch $((with_torch - started)) s, gs2d and the rest $((done_ - with_torch)) s"
 env/bin/gs2d --version
 env/bin/gs2d doctor | grep 'yes  cpu' || { echo "error: the wheel must bring the native kernels" >&2; exit 1; }
-env/bin/gs2d demo --out demo --schedule-scale 0.02 --no-page
+env/bin/gs2d demo --out demo --schedule-scale 0.02 --set page=false
 [ -s demo/mesh.ply ] && [ -s demo/report.html ]

@@ -110,7 +110,7 @@ def test_mesh_render_and_export_work_on_a_run(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = str(trained)
-    assert run(["mesh", name, "--out", str(tmp_path / "m.ply"), "--voxel", "0.1", "--json"]) == 0
+    assert run(["mesh", name, "--out", str(tmp_path / "m.ply"), "--set", "voxel=0.1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["voxel"] == pytest.approx(0.1)
     assert run(["render", name, "--split", "train", "--out", str(tmp_path / "views"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["images"] == 3

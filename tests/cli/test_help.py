@@ -97,14 +97,14 @@ def test_every_option_is_parsed_and_fills_its_field() -> None:
             )
             parsed = parse([name, *(word for other in needed for word in written(other))])
             assert option.default not in values_of(parsed, option.field), option
-    assert "--no-page" in {flag for option in options_of(NAMES["train"]) for flag in option.flags}
+    assert "--no-refine" in {flag for option in options_of(NAMES["mesh"]) for flag in option.flags}
 
 
 def written(option: Option) -> list[str]:
     """An option with a value that is not its default, in words."""
     value = option.choices[-1] if option.choices else "-1.5e-1" if option.kind is float else "97"
     if option.mark.setting:
-        value = "true" if option.kind is bool else value
+        value = str(not option.default).lower() if option.kind is bool else value
         return ["--set", f"{option.field}={','.join([value] * (option.count or 2))}"]
     values = [] if option.kind is bool else [value] * (option.count or 2)
     return [*option.flags, *values]
@@ -123,7 +123,7 @@ def values_of(parsed: object, field: str) -> list[object]:
         ("train in --out out --seed 1 --seed=2", "seed", 2),
         ("train in --out out --set a=1 --set b=-2", "overrides", ("a=1", "b=-2")),
         ("train in --out out --schedule_scale 0.5", "schedule_scale", 0.5),
-        ("train in --no-page --out out", "page", False),
+        ("train in --set page=false --out out", "page", False),
         ("recipes --json 2dgs", "name", "2dgs"),
         ("sweep a --data here --out there b", "recipes", ("a", "b")),
         ("train in --out out --viewer", "viewer", 0),

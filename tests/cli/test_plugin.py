@@ -55,7 +55,7 @@ def trained(gs2d: CliProcess, tmp_path_factory: pytest.TempPathFactory) -> Path:
     capture = write_capture(folder / "ball")
     (folder / "link").mkdir()
     (folder / "link" / "capture.txt").write_text(str(capture))
-    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page")
+    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--set", "page=false")
     chosen = ("--recipe", "example-2dgs", "--backend", "example-checked")
     gs2d("train", folder / "link", "--out", folder / "run", *chosen, *few)
     return folder / "run"
@@ -147,7 +147,7 @@ def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: CliProcess, trained: Pa
     """What `gs2d recipes --json` prints, and what trained the run, are one recipe."""
     file = trained.parent / "mine.json"
     file.write_text(gs2d("recipes", "example-2dgs", "--json").stdout)
-    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page")
+    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--set", "page=false")
     chosen = ("--recipe", file, "--backend", "example-checked")
     said = gs2d("train", trained.parent / "link", "--out", trained, *chosen, *few, "--resume")
     assert "resuming after" in said.stdout + said.stderr

@@ -49,7 +49,18 @@ def test_the_core_trains_and_exports_without_contrib(tmp_path: Path) -> None:
     assert "demo" not in listed
     capture = tmp_path / "ring"
     small_colmap(capture)
-    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page", "--recipe", "2dgs", "--robust", "off")
+    few = (
+        "--set",
+        "init_points=60",
+        "--schedule-scale",
+        "0.0003",
+        "--set",
+        "page=false",
+        "--recipe",
+        "2dgs",
+        "--robust",
+        "off",
+    )
     run("train", capture, "--out", tmp_path / "run", *few)
     run("export", tmp_path / "run", "--out", tmp_path / "a.ply")
     assert (tmp_path / "a.ply").stat().st_size > 1000

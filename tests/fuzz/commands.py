@@ -108,7 +108,7 @@ def _parsed(words: tuple[str, ...]) -> Any:
 LINES = (
     "train CAPTURE --out RUN --recipe 2dgs-r --schedule-scale 0.1 --set init_points=100 --downscale 2 --seed 3",
     "train CAPTURE --out RUN --set surface.densify.max_splats=150 --threads 2 --checkpoint-every 100 --resume",
-    "mesh RUN --voxel 0.01 --set depth=median --texture --set texture_size=512",
+    "mesh RUN --set voxel=0.01 --set depth=median --texture --set texture_size=512",
     "render RUN --split test --out FOLDER --orbit 30",
     "export RUN --out a.spz --format spz",
     "edit RUN --merge OTHER --transform 2 90 0 0 0 0 1.5 --out b.ply",

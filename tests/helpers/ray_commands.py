@@ -53,7 +53,7 @@ def blocks_words(capture: Path, job: Path, address: str, schedule: float) -> lis
         str(schedule),
     ]
     words += [word for change in (*WORDS, "surface.densify.max_splats=600") for word in ("--set", change)]
-    words += ["--backend", "cpu", "--threads", "1", "--no-page", "--checkpoint-every", "4"]
+    words += ["--backend", "cpu", "--threads", "1", "--set", "page=false", "--checkpoint-every", "4"]
     return [*words, "--cluster", address]
 
 

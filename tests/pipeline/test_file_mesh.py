@@ -102,7 +102,7 @@ def test_a_file_of_each_kind_is_meshed_without_cameras(tmp_path: Path, layout: s
     file = tmp_path / ("ball.spz" if layout == "spz" else "ball.compressed.ply" if layout == "compressed" else "b.ply")
     write_splats(file, ball(), layout=layout)
     out = tmp_path / "mesh.ply"
-    assert run(["mesh", "--splats", str(file), "--out", str(out), "--voxel", "0.06", "--threads", "1"]) == 0
+    assert run(["mesh", "--splats", str(file), "--out", str(out), "--set", "voxel=0.06", "--threads", "1"]) == 0
     mesh = read_mesh(out)
     distance = np.linalg.norm(mesh.vertices, axis=1)
     assert len(mesh.faces) > 100
@@ -122,8 +122,8 @@ def test_the_cameras_of_a_capture_are_used(tmp_path: Path, capsys: pytest.Captur
         str(capture),
         "--out",
         str(out),
-        "--voxel",
-        "0.06",
+        "--set",
+        "voxel=0.06",
         "--threads",
         "1",
     ]

@@ -158,7 +158,7 @@ def test_a_run_remembers_its_masks(tmp_path: Path, capsys: pytest.CaptureFixture
     root = write_ball(tmp_path / "capture", 0)
     (root / "masks").rename(tmp_path / "mine")
     words = ["train", str(root), "--out", str(tmp_path / "run"), "--recipe", "2dgs", "--schedule-scale", "0.0005"]
-    words += ["--set", "init_points=60", "--quiet", "--no-page", "--masks", str(tmp_path / "mine")]
+    words += ["--set", "init_points=60", "--quiet", "--set", "page=false", "--masks", str(tmp_path / "mine")]
     assert run([*words, "--masked", "empty"]) in (0, 3)  # 3: there is no surface yet
     data = json.loads((tmp_path / "run" / "run.json").read_text())
     assert data["scene"]["masks"] == {"folder": str(tmp_path / "mine"), "masked": "empty", "found": 8}

@@ -134,7 +134,7 @@ def a_capture(photos: Path) -> None:
         (lambda photos: write_room(photos, 3), ["--test-every", "1"], "--test-every must be 0"),
         (lambda photos: write_room(photos, 3), ["--recipe", "3dgs"], "no recipe '3dgs'"),
         (lambda photos: write_room(photos, 3), ["--protocol", "x"], "protocol must be one of"),
-        (lambda photos: write_room(photos, 3), ["--cache", "/dev/null/x"], "cannot write /dev/null/x"),
+        (lambda photos: write_room(photos, 3), ["--set", "cache=/dev/null/x"], "cannot write /dev/null/x"),
         (lambda photos: write_room(photos, 3), ["--set", "max_size=3"], "number"),
     ],
 )

@@ -180,7 +180,7 @@ def test_a_capture_that_changed_is_told_and_nothing_is_lost(straight: Path, capt
     ("changes", "text"),
     [
         ({"blocks": "0x2"}, "--blocks must be auto, or two or three whole numbers of 1 or more"),
-        ({"slots": 0}, "--slots must be a whole number >= 1, got 0"),
+        ({"slots": 0}, "--set slots must be a whole number >= 1, got 0"),
         ({"recipe": "no-such"}, "no-such"),
         ({"overrides": ("partition.margin=2",)}, "partition.margin must be at most 1"),
     ],

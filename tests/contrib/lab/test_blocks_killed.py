@@ -24,7 +24,19 @@ def command(capture: Path, job: Path) -> list[str]:
     words = ["blocks", str(capture), "--out", str(job), "--blocks", "2x2", "--recipe", "2dgs", "--robust", "off"]
     words += ["--set", "partition.min_views=3", "--set", "partition.coarse.schedule=0.5", "--schedule-scale", "0.0006"]
     words += [word for change in (*WORDS, "surface.densify.max_splats=600") for word in ("--set", change)]
-    words += ["--backend", "cpu", "--threads", "1", "--no-page", "--checkpoint-every", "4", "--slots", "2", "--quiet"]
+    words += [
+        "--backend",
+        "cpu",
+        "--threads",
+        "1",
+        "--set",
+        "page=false",
+        "--checkpoint-every",
+        "4",
+        "--set",
+        "slots=2",
+        "--quiet",
+    ]
     return [sys.executable, "-m", "gs2d", *words]
 
 

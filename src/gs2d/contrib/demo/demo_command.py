@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from gs2d.cli.commands import BEGIN, Common, register_command
-from gs2d.config.arguments import PYTHON_ONLY
+from gs2d.config.arguments import PYTHON_ONLY, SETTING
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.recipe import Recipe
 from gs2d.pipeline.prepare.options import HowItRuns, ViewerOption
@@ -23,8 +23,8 @@ class DemoOptions(HowItRuns):
     """Recipe. `gs2d recipes` lists them."""
     schedule_scale: float | None = None
     """Fraction of the iterations of the recipe (default: 0.15, two minutes on two cores)."""
-    page: bool = True
-    """Do not write scene.html, the splats as a page for any browser."""
+    page: Annotated[bool, SETTING] = True
+    """Whether to write scene.html, the splats as a page for any browser."""
     viewer: ViewerOption = None
     """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
     train_views: Annotated[int, PYTHON_ONLY] = 40

@@ -259,7 +259,7 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     """
     partition = make_partition(options.blocks, options.partition_changes)
     if options.slots is not None and options.slots < 1:
-        raise RecipeError(f"--slots must be a whole number >= 1, got {options.slots}")
+        raise RecipeError(f"--set slots must be a whole number >= 1, got {options.slots}")
     training = training_of(options)
     check_options(training)
     check_folder(options.out)

@@ -79,7 +79,7 @@ def execute(
     """
     slots, cluster = workers.slots, workers.cluster
     if slots is not None and slots < 1:
-        raise BackendError(f"--slots must be a whole number >= 1, got {slots}")
+        raise BackendError(f"--set slots must be a whole number >= 1, got {slots}")
     with contextlib.ExitStack() as held:
         ray = None
         if cluster is not None and (todo := [task for task in tasks if not task.is_done()]):

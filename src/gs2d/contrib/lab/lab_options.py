@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from gs2d.config.arguments import Arg
+from gs2d.config.arguments import SETTING, Arg
 from gs2d.errors import RecipeError
 from gs2d.pipeline.prepare.options import CommonTraining, Options, Overrides, Resources
 
@@ -39,13 +39,13 @@ class SweepOptions(Options):
     """Seeds, such as 0,1,2, or a count: 3 means 0,1,2."""
     backend: str = "auto"
     """Rasterizer."""
-    slots: int | None = None
+    slots: Annotated[int | None, SETTING] = None
     """Number of parallel runs (default: one per GPU, else one)."""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
     threads: int | None = None
     """CPU threads per run (default: the cores divided by the number of parallel runs)."""
-    cache: Annotated[Path | None, Arg(metavar="DIR")] = None
+    cache: Annotated[Path | None, Arg(metavar="DIR", setting=True)] = None
     """Folder that keeps finished stages (default: in --out). Tables that share it train common stages once."""
     ground_truth: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of true surfaces, NAME.ply, for captures without mesh_gt.ply."""
@@ -101,7 +101,7 @@ class BlocksOptions(CommonTraining, Resources):
     overrides: Overrides = ()
     """Change the recipe, e.g. --set surface.iterations=2000, or the partition, e.g. --set partition.margin=0.3; may be
     repeated."""
-    slots: int | None = None
+    slots: Annotated[int | None, SETTING] = None
     """Number of parallel runs (default: one per GPU, else one)."""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""

@@ -110,7 +110,7 @@ def check_folder(plan: Plan) -> None:
         if before.get(name) != value:
             raise RunError(
                 f"{plan.options.out} holds a table made with {name} = {before.get(name)}, now {value}; "
-                "choose another --out (--cache may stay: stages that are the same are taken from there)"
+                "choose another --out (--set cache=may stay: stages that are the same are taken from there)"
             )
 
 

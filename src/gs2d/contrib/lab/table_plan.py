@@ -6,8 +6,9 @@ import itertools
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, get_type_hints
 
+from gs2d.config.arguments import Arg
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.recipe_files import short_name
@@ -150,9 +151,15 @@ def commands_of(task: TrainingTask) -> list[str]:
 def _command(words: Sequence[str], options: Any, said: Sequence[str]) -> str:
     """Return a command line: its first words, and each option with another value than the default, without ``said``."""
     line = ["gs2d", *words]
+    hints = get_type_hints(type(options), include_extras=True)
     for field in fields(options):
         value = getattr(options, field.name)
         if field.name in said or value == field.default:
+            continue
+        if any(isinstance(mark, Arg) and mark.setting for mark in getattr(hints[field.name], "__metadata__", ())):
+            parts = value if isinstance(value, tuple) else (value,)
+            text = ",".join(str(part).lower() if isinstance(part, bool) else str(part) for part in parts)
+            line += ["--set", f"{field.name}={text}"]
             continue
         flag = "--" + field.name.replace("_", "-")
         if field.name == "overrides":

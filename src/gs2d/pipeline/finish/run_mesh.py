@@ -153,7 +153,7 @@ def fused(
 def check_mesh_options(options: MeshOptions) -> None:
     """Raise for invalid options, before anything is rendered."""
     for name in ("voxel", "truncation", "depth_limit"):
-        value, option = getattr(options, name), f"--{name.replace('_', '-')}"
+        value, option = getattr(options, name), f"--set {name}"
         if value is not None and not (value > 0 and math.isfinite(value)):
             raise ProtocolError(f"{option} must be a positive number of world units, got {value}")
         if value is not None and not 1 / LARGEST <= value <= LARGEST:

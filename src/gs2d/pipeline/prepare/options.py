@@ -119,8 +119,8 @@ class CommonTraining(Options):
     """Change the recipe, e.g. --set surface.iterations=2000; may be repeated."""
     checkpoint_every: Annotated[str | int, Arg(metavar="N|TIME")] = "2m"
     """Iterations (500) or time (90s, 10m) between checkpoints."""
-    page: bool = True
-    """Do not write scene.html, the splats as a page for any browser."""
+    page: Annotated[bool, SETTING] = True
+    """Whether to write scene.html, the splats as a page for any browser."""
     masked: Literal["ignore", "empty", "off"] | None = None
     """Meaning of black mask pixels: ignore (not used), empty (transparent), or off (masks are not used) (default:
     ignore, or by protocol)."""
@@ -143,7 +143,7 @@ class CommonTraining(Options):
 class Training(CommonTraining):
     """Options of the commands that train a scene in one piece: `gs2d train` and `gs2d reconstruct`."""
 
-    cache: Annotated[Path | None, Arg(metavar="DIR")] = None
+    cache: Annotated[Path | None, Arg(metavar="DIR", setting=True)] = None
     """Folder that keeps finished stages for reuse by runs with the same scene and settings."""
     viewer: ViewerOption = None
     """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
@@ -235,7 +235,7 @@ class MeshOptions(Options):
     """tsdf fuses the depth maps in voxels. delaunay cuts tetrahedra: fewer false pieces, but thin parts are lost."""
     watertight: bool = False
     """Close the surface where no photograph shows it, too. Implies --method delaunay."""
-    voxel: float | None = None
+    voxel: Annotated[float | None, SETTING] = None
     """Voxel size in world units (default: from the scene)."""
     truncation: Annotated[float | None, SETTING] = None
     """Truncation distance in world units (default: from the voxel size)."""
