@@ -138,10 +138,11 @@ def fused(
         if not bounded:
             limit = result.limits.depth_limit
             line = (
-                f"{part} beyond {limit:.4g} world units, where depth is too uncertain; --set depth_limit extends the mesh"
+                f"{part} beyond {limit:.4g} world units, where depth is too uncertain; "
+                "--set depth_limit extends the mesh"
             )
         else:
-            line = f"{part} outside the fused box; --scene meshes everything, --bbox or --set depth_limit extend the box"
+            line = f"{part} outside the fused box; --scene meshes everything, --bbox or --set depth_limit extend it"
         on_event(Notice(line))
     if not options.refine or options.watertight or not bounded or not loaded.protocol.fusion.subject:
         return result
