@@ -14,7 +14,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
 from gs2d.config.robust import DenseStart
 from gs2d.config.schedule import scale_schedule
-from gs2d.core.camera import look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.core.sh import sh_to_rgb
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
@@ -33,6 +33,13 @@ from wall_scene import WALL, wall
 BALL = DenseStart(side=64, neighbours=3, cell=2.0)
 PIXEL = 3.0 / 80  # world units at the centre of the ball
 BOUNDS = np.array([[-1.2, -1.2, -1.2], [1.3, 1.2, 1.2]])
+
+
+def turn(camera: Camera, angle: float) -> Camera:
+    """Turn a camera about its vertical axis (radians), which shifts what it sees."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    about_y = np.array([[cos, 0, sin, 0], [0, 1, 0, 0], [-sin, 0, cos, 0], [0, 0, 0, 1]])
+    return replace(camera, T_cam_world=about_y @ camera.T_cam_world)
 
 
 @cache
@@ -89,6 +96,20 @@ def test_depth_maps_that_are_shifted_against_each_other_are_averaged() -> None:
     assert np.median((found / true[0])[inner]) == pytest.approx(mean, abs=1e-3)
     assert not averaged(views, depths, 1, (0, 2))[:, :10].any()
     np.testing.assert_allclose(averaged(views, depths, 2, (0, 1, 3, 4))[inner], depths[2][inner])
+
+
+@pytest.mark.parametrize(("angles", "differ"), [((0.0,) * 5, False), ((0.03, 0.0, -0.03, 0.03, -0.01), True)])
+def test_depth_maps_are_averaged_if_the_cameras_are_off(
+    angles: tuple[float, ...], differ: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turned = (replace(view, camera=turn(view.camera, a)) for view, a in zip(wall().train, angles, strict=True))
+    scene, settings = replace(wall(), train=tuple(turned)), replace(BALL, side=48, min_angle=1.0)
+    # A pixel of these small images is 2.5 % of the depth, so depths that agree to 2 % are never 0.75 px apart.
+    monkeypatch.setattr("gs2d.training.start.plane_sweep.SHIFTED", 0.3)
+    found = sweep_views(scene, settings)
+    monkeypatch.setattr("gs2d.training.start.plane_sweep.FUSIONS", 0)
+    plain = sweep_views(scene, settings)
+    assert np.array_equal(found.depths[3], plain.depths[3]) is not differ
 
 
 def test_swept_points_lie_on_the_ball() -> None:
