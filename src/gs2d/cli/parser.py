@@ -30,6 +30,7 @@ _ELSEWHERE: dict[str, tuple[str, str]] = {  # option of other programs or earlie
     **dict.fromkeys(("--iterations", "--iters", "--max-steps", "--num-iters", "--steps", "--total-steps"), _SHORTER),
     **dict.fromkeys(("-r", "--resolution", "--data-factor", "--images", "--downscale-factor"), _SMALLER),
     "--eval": ("--test-every", "--test-every 8 holds out every eighth photograph"),
+    "--no-page": ("--set", "--set page=false leaves scene.html out"),
     "--refine": ("--no-refine", "meshes of photographs are refined without an option"),
 }
 _OUTPUTS = ("out", "video", "cache")  # paths that need not exist
