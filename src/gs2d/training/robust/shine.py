@@ -28,13 +28,13 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
 from gs2d.meshing.fusion_bounds import backproject
+from gs2d.meshing.refine import MATT, OFTEN, RARELY, SHINY
 from gs2d.meshing.warped_ncc import DrawnMesh, GreyImage, MatchSettings, brightness_share
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 
 WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are made anew: the surface must be there
-MATT, SHINY, RARELY, OFTEN = 0.1, 0.2, 0.1, 0.3  # as in mesh refinement
 CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny things have matt-looking spots
 TINY = 1e-12
 WORKERS = 4  # threads; those of the library come on top
