@@ -22,7 +22,7 @@ from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.robust.shine import CELLS, shine_maps
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from saved_states import resumed_everywhere
 from together import robust
 from train_toys import full_state, random_splats
@@ -108,3 +108,13 @@ def test_training_finds_shine_and_resumes_with_it() -> None:
     assert trainer.state.shine is not None
     assert trainer.state.shine.float().mean() > 20
     resumed_everywhere(scene, recipe, "cpu", every=4)
+
+
+def test_frozen_splats_show_the_surface_too() -> None:
+    scene, few = with_reflection(wall()), random_splats(5)
+    few.opacity_logits[:] = -4.0
+    frozen = Splats(**{**dict(flat_wall().items()), "shN": torch.zeros(len(flat_wall()), 3, 3)})
+    trainer = Trainer(scene, robust(), GENERIC, backend="cpu", init=few, options=TrainerOptions(frozen=frozen))
+    trainer.run()
+    assert trainer.state.shine is not None
+    assert trainer.state.shine.float().mean() > 20

@@ -19,8 +19,8 @@ from gs2d.meshing.marching_cubes import components, select_faces
 
 SMALL = 0.01  # of the area of the largest component: smaller components are removed
 SEEN, LEAST_PIXELS = 0.5, 50.0
-"""Smaller ones stay if at least this part of the views that see the largest one see them, in so many pixels. On the
-judge's wheel, loose spokes and hub have 0.55 or more; floaters of 50 px before facades and metal at most 0.3."""
+"""Smaller ones stay if they have as many pixels, and this fraction of the views that see the largest one see them. On
+the judge's wheel, loose spokes and hub have 0.55 or more; floaters of 50 px before facades and metal at most 0.3."""
 _TINY = 1e-300
 VIEWS = 2  # that must see a vertex: a single view does not measure depth
 VERTICES_AT_ONCE = 1 << 15  # temporaries of this many vertices fit in the cache of a core

@@ -15,7 +15,7 @@ from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import RunError, ShapeError
 from gs2d.training.learned_rows import LearnedRows
 
-FORMAT = 1  # of the state dict
+FORMAT = 2  # of the state dict
 # Errors that reading a damaged state dict raises.
 _BROKEN = (LookupError, TypeError, AttributeError, RuntimeError, ValueError, ArithmeticError)
 
@@ -208,7 +208,9 @@ class TrainState:
         statistics = {f"statistics {name}": tensor for name, tensor in (self.statistics or {}).items()}
         for name, tensor in statistics.items():
             arrays[name] = (tensor, " ".join(["N", *["_"] * (tensor.dim() - 1)]))
-        check_shapes(arrays)
+        check_shapes(arrays if self.shine is None else {**arrays, "shine": (self.shine, "V S S")})
+        if self.shine is not None and self.shine.dtype != torch.uint8:
+            raise ShapeError(f"shine must be torch.uint8, got {self.shine.dtype}")
         dtype = self.splats.dtype
         for name, tensor in [*parameters.items(), *((name, array) for name, (array, _) in arrays.items())]:
             expected = torch.bool if name in groups else tensor.dtype if name in statistics else dtype

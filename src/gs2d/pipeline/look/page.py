@@ -166,7 +166,7 @@ def _most_splats(centers: np.ndarray) -> Subject:
 
 
 def some_views(views: Sequence[View], most: int = MAX_VIEWS) -> list[View]:
-    """Return at most so many of the views, evenly spaced, with the first and the last."""
+    """Return at most ``most`` views, evenly spaced, with the first and the last."""
     count = min(len(views), most)
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
 

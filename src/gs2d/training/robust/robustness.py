@@ -205,7 +205,9 @@ class Robustness:
             image = self._images[row]
             return GreyImage(self._camera(state, row), image.grey[0, 0].numpy(), image.usable)
 
-        maps = shine.shine_maps(state.splats, image_at, self._neighbours, self._raster, self._backend, library)
+        maps = shine.shine_maps(
+            self._whole(state.splats), image_at, self._neighbours, self._raster, self._backend, library
+        )
         return maps.to(state.splats.device)
 
     def _are_shown(self, splats: Splats, large: Tensor) -> Tensor:
@@ -229,7 +231,7 @@ class Robustness:
         raster = self._raster if self._removal.backdrop else replace(self._raster, background=BLACK)
         step = max(1, -(-len(self._images) // MAX_WITNESSES))
         rows = range(iteration // self._removal.every % step, len(self._images), step)
-        whole = splats if self._frozen is None else splats.followed_by(self._frozen)
+        whole = self._whole(splats)
         needed = missed(
             whole,
             torch.cat([against, against.new_zeros(len(whole) - len(splats))]),
@@ -241,6 +243,10 @@ class Robustness:
         verdict[proposed] = REMOVED
         verdict[needed] = NEEDED
         return verdict
+
+    def _whole(self, splats: Splats) -> Splats:
+        """Return the splats, followed by the frozen ones."""
+        return splats if self._frozen is None else splats.followed_by(self._frozen)
 
     @property
     def _removal(self) -> Removal:

@@ -119,7 +119,7 @@ def _shine(view: _Seen, beside: Sequence[_Seen], library: Library) -> np.ndarray
 
 
 def _shown_by(view: _Seen, maps: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """Return the lower median of what other maps show at the surface in the cells of a photograph."""
+    """Return the lower median of other maps at the surface that the cells of a photograph show."""
     camera, centres = view.image.camera, (np.arange(CELLS) + 0.5) / CELLS
     rows, columns = (np.floor(centres * side).astype(int) for side in view.depth.shape)
     rows, columns = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))

@@ -211,9 +211,9 @@ def averaged(
         agrees = inside & (there > 0) & (np.abs(there - z) <= AGREE * z)
         total[agrees] += z[agrees] / (own * np.where(there > 0, there, 1))[agrees]
         count += agrees
-    averaged = np.zeros_like(depth)
-    averaged[known] = count / total
-    return averaged
+    result = np.zeros_like(depth)
+    result[known] = count / total
+    return result
 
 
 def sweep_downscale(scene: Scene, settings: DenseStart) -> int:
