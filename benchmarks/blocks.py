@@ -22,11 +22,11 @@ import itertools
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 
 from benchmarks.flight import Flight, write_flight
@@ -39,17 +39,15 @@ from gs2d.contrib.lab.split import read_split
 from gs2d.contrib.lab.surface_score import evaluate_surface
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
-from gs2d.core.splats import Splats
 from gs2d.data.scene import View
 from gs2d.errors import Gs2dError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS
 from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
-from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.loaded import Trained, open_finished
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
-from gs2d.render.api import rasterize
 from gs2d.training.events import Notice
 
 ALL_OF = {"2dgs": 30_000, "best": 20_000}  # iterations of the recipes
@@ -118,10 +116,9 @@ def psnr(squares: list[np.ndarray]) -> float:
     return -10 * math.log10(float(np.concatenate(squares).mean()))
 
 
-def shown(job: LoadedRun, splats: Splats, view: View) -> tuple[np.ndarray, np.ndarray]:
+def shown(job: Trained, view: View) -> tuple[np.ndarray, np.ndarray]:
     """Return a rendering of a view [H, W, 3] in [0, 1], and its squared error per pixel [H, W]."""
-    with torch.no_grad():
-        color = rasterize(splats, view.camera, job.settings, backend=job.backend).color.clamp(0, 1).numpy()
+    color = job.render(view.camera).color.clamp(0, 1).numpy()
     return color, ((color - view.target(job.settings.background)) ** 2).mean(axis=2)
 
 
@@ -129,15 +126,15 @@ def by_distance(folder: Path, args: argparse.Namespace) -> str:
     """Return PSNR by distance from a seam: the whole training, and blocks before and after the seams are refined."""
     job_of_blocks = job_folder(folder, args)
     cells, truth = read_split(job_of_blocks / "partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
-    _, job, whole = open_finished(folder / "whole", args.threads, lambda _event: None)
+    _, job = open_finished(folder / "whole", args.threads, lambda _event: None)
     views = job.scene.test
     distances = np.concatenate([seam_distances(view.camera, truth, cells).ravel() for view in views])
     ranges = [(low, high) for low, high in itertools.pairwise(FROM) if ((distances >= low) & (distances < high)).any()]
     lines = ["| PSNR, dB | " + " | ".join(f"{low} to {high} m" for low, high in ranges) + " |"]
     lines.append("|---" * (len(ranges) + 1) + "|")
     before, after = (read_splats(job_of_blocks / name) for name in (MERGED, SPLATS))
-    for name, splats in {"whole": whole, "before seams": before, "blocks": after}.items():
-        every = np.concatenate([shown(job, splats, view)[1].ravel() for view in views])
+    for name, splats in {"whole": job.splats, "before seams": before, "blocks": after}.items():
+        every = np.concatenate([shown(replace(job, splats=splats), view)[1].ravel() for view in views])
         cells_of = [f"{psnr([every[(distances >= low) & (distances < high)]]):.2f}" for low, high in ranges]
         lines.append(f"| {name} | " + " | ".join(cells_of) + " |")
     return "\n".join(lines)
@@ -154,10 +151,10 @@ def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, floa
     drawn = sorted(views, key=lambda view: -float((distances[view.name] < args.near / 4).mean()))[:3]
     found: dict[str, dict[str, float]] = {}
     colors: dict[str, dict[str, np.ndarray]] = {view.name: {} for view in drawn}
-    for name, (run, job, splats) in runs.items():
+    for name, (run, job) in runs.items():
         pixels, near = 0, []
         for view in views:
-            color, square = shown(job, splats, view)
+            color, square = shown(job, view)
             pixels += square.size
             near.append(square[distances[view.name] < args.near])
             if view.name in colors:
@@ -170,7 +167,7 @@ def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, floa
         recall = float((score.clouds.truth_distances[at_seam[1]] < args.within).mean())
         (stage,) = run.metrics()["stages"]
         found[name] = {
-            **{"splats": len(splats), "iterations": stage["iterations"], "seconds": stage["seconds"]},
+            **{"splats": len(job.splats), "iterations": stage["iterations"], "seconds": stage["seconds"]},
             "psnr": stage["test"]["psnr"],
             "psnr_near_seams": psnr(near),
             "pixels_near_seams": np.concatenate(near).size / pixels,

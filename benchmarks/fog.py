@@ -34,8 +34,9 @@ from gs2d.data import Scene, View, load_scene
 from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
 from gs2d.evaluation.image_metrics import image_metrics, psnr_float
 from gs2d.pipeline.prepare.learned_views import photographed
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.options import Training
-from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, robust_and_exposure, with_backdrop
 from gs2d.render.api import rasterize
 from gs2d.render.exposure_transform import fit_exposure
@@ -83,8 +84,7 @@ def train_variant(scene: Scene, name: str, recipe: str, scale: float, seed: int)
 def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
     """Return the figures of a trained scene."""
     settings, splats = trainer.settings, trainer.splats
-    brightness = metered(splats, settings, trainer.backend)
-    seen = with_predicted(trainer.scene_now(), brightness)
+    seen = predicted(Trained(splats, trainer.scene_now(), trainer.protocol, settings, trainer.backend)).scene
     tests = [_score(scene, view, splats, settings) for view in seen.test]
     by_view = [score["psnr"] for score in tests]
     chosen = seen.train[:: max(1, len(scene.train) // TRAINING_VIEWS)]

@@ -175,12 +175,10 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
     # Imported while the clocks are stopped: training does not need these modules.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.finish.scoring import score_views
-    from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+    from gs2d.pipeline.prepare.predicted_exposure import predicted
 
-    brightness = metered(splats, job.settings, job.backend)
-    scene = with_predicted(learned or job.scene, brightness)
-    views = scene.test or scene.train
-    scores = score_views(splats, views, job.settings, job.backend, ignore)
+    shown = predicted(job.trained(splats, learned))
+    scores = score_views(shown, shown.scene.test or shown.scene.train, ignore)
     summary = dict(summary_of(scores) or {})
     summary.pop("psnr_by_view", None)
     size = float(splats.scales.max()) / job.scene.extent

@@ -333,7 +333,7 @@ def measure_peer(
     DataError
         If OpenSplat fails, or a training does not fit into the budget.
     """
-    _, job, _ = open_finished(run, None, ignore)
+    _, job = open_finished(run, None, ignore)
     scene, whole = job.scene, folder / "whole.json"
     around = [canvas(view.camera) for view in scene.views]
     if not whole.exists():

@@ -19,11 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
-from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.data.subject_box import find_subject
 from gs2d.errors import DataError
@@ -33,15 +31,13 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
 from gs2d.meshing.depth_maps import depth_map
 from gs2d.meshing.evidence import gather, pixels
-from gs2d.pipeline.finish.run_images import render_view
 from gs2d.pipeline.finish.run_mesh import fusion_frame
 from gs2d.pipeline.finish.run_subject import sights, surface_reach
 from gs2d.pipeline.finish.scoring import score_views
-from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.loaded import Trained, open_finished
 from gs2d.pipeline.prepare.open_capture import FEW
-from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import predicted
 from gs2d.pipeline.reconstruct import CAPTURE
-from gs2d.render.api import rasterize
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.workspace import POSES_JSON
 from gs2d.training.events import ignore
@@ -221,32 +217,30 @@ def score_run(path: Path) -> dict[str, Any]:
     Test views use the exposure predicted from neighbouring training images, as in the run's own scores, and none in
     "test_plain".
     """
-    _, job, splats = open_finished(path, None, ignore)
-    drawing = (job.settings, job.backend)
-    scene = with_predicted(job.scene, metered(splats, *drawing))
+    run, job = open_finished(path, None, ignore)
+    scene = predicted(job).scene
 
     def scores(views: Sequence[View]) -> dict[str, Any] | None:
-        return summary_of(score_views(splats, views, *drawing, ignore))
+        return summary_of(score_views(job, views, ignore))
 
     return {
         "test": scores(scene.test),
         "test_plain": scores(job.scene.test),
         "train": scores(scene.train),
-        "hidden": hidden_fraction(job, splats),
-        "splats": len(splats),
-        "downscale": job.resolved.downscale,
+        "hidden": hidden_fraction(job),
+        "splats": len(job.splats),
+        "downscale": run.definition()["downscale"],
         "pixels": [job.scene.views[0].camera.width, job.scene.views[0].camera.height],
     }
 
 
-def hidden_fraction(job: LoadedRun, splats: Splats) -> dict[str, Any] | None:
+def hidden_fraction(job: Trained) -> dict[str, Any] | None:
     """Return the share of sparse points hidden by the median depth of test views; None without test views or points."""
     observed, counts = job.scene.observed(guessed=False), {}
     if observed is None or not job.scene.test:
         return None
     for view in job.scene.test:
-        with torch.no_grad():
-            depth = rasterize(splats, view.camera, job.settings, backend=job.backend).depth_median.cpu().numpy()
+        depth = job.render(view.camera).depth_median.cpu().numpy()
         counts[view.name] = hidden_points(np.asarray(depth), observed.in_view(view.name, view.camera))
     whole = total(list(counts.values()))
     if whole.fraction is None:
@@ -319,20 +313,20 @@ def measure_mesh(path: Path) -> dict[str, Any]:
     The box is computed from the splats by the current program, whatever box the run used or whether its mesh was
     cropped.
     """
-    run, job, splats = open_finished(path, None, ignore)
+    run, job = open_finished(path, None, ignore)
     mesh = read_mesh(run.file(MESH))
     facts: dict[str, Any] = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
-    facts["faces_per_pixel"] = round(len(mesh.faces) / max(pixels_of(job, splats, mesh), 1.0), 3)
+    facts["faces_per_pixel"] = round(len(mesh.faces) / max(pixels_of(job, mesh), 1.0), 3)
     try:
-        subject = find_subject(sights(job, splats))
+        subject = find_subject(sights(job))
     except DataError as error:
         return facts | {"subject": str(error), "share_in_subject": None}
     return facts | {"subject": subject.kind, "share_in_subject": round(fraction_in_box(mesh, subject.box), 4)}
 
 
-def pixels_of(job: LoadedRun, splats: Splats, mesh: Mesh) -> float:
+def pixels_of(job: Trained, mesh: Mesh) -> float:
     """Return the number of training pixels that show a mesh; each part counts in the view that sees it best."""
-    views = ((view, render_view(splats, view, job.settings, job.backend)) for view in job.scene.train)
+    views = ((view, job.render(view.camera)) for view in job.scene.train)
     reach = surface_reach(job)
     maps = (depth_map(fusion_frame(job, view, output, "median", reach)) for view, output in views)
     return pixels(mesh, gather(mesh, maps, SAME_SURFACE * job.scene.extent))

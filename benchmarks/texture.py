@@ -38,7 +38,7 @@ from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import bilinear
 from gs2d.pipeline.finish.run_texture import textured_mesh
 from gs2d.pipeline.prepare.learned_views import as_scene
-from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import TextureOptions
 
@@ -140,7 +140,9 @@ def main() -> None:
         job = replace(job, scene=replace(job.scene, train=rest, test=views))
     meshes: dict[str, Mesh | TexturedMesh] = {"vertex colours": mesh}
     start, cpu = time.perf_counter(), time.process_time()
-    baked = textured_mesh(job, mesh, TextureOptions(faces=arguments.faces, texture_size=arguments.size))
+    baked = textured_mesh(
+        job.trained(finished_splats(run)), mesh, TextureOptions(faces=arguments.faces, texture_size=arguments.size)
+    )
     took = f"{time.perf_counter() - start:.1f} s ({time.process_time() - cpu:.1f} s of CPU)"
     size, unseen = len(baked.mesh.texture), baked.unseen / baked.texels
     print(f"texture: {size}x{size}, {len(baked.mesh.faces):,} faces, {unseen:.2%} unseen, {took}", flush=True)

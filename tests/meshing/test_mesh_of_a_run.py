@@ -152,12 +152,12 @@ def test_a_run_without_a_gpu_is_fused_by_the_cpu(
         asked.append(device)
         return integrator(volumes, device)
 
-    job, splats = reload_run(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
+    job = reload_run(RunFolder(run), lambda _event: None).trained(finished_splats(RunFolder(run)))
     monkeypatch.setattr("gs2d.meshing.tsdf_volume.integrator", recorded)
     for backend in ("reference", "cpu"):
         options = MeshOptions(method=method, voxel=0.05)
         result = extract_mesh(
-            replace(job, backend=get_backend(backend)), splats, options, tmp_path / "mesh.ply", lambda _event: None
+            replace(job, backend=get_backend(backend)), options, tmp_path / "mesh.ply", lambda _event: None
         )
         assert result["fused_by"] == "cpu"
     assert asked == [None, None]

@@ -61,12 +61,11 @@ def test_the_transforms_are_written_and_their_mean_is_the_identity(run: RunFolde
 
 
 def test_training_views_are_scored_in_their_exposures(run: RunFolder) -> None:
-    _, job, splats = open_finished(run.path, 1, ignore)
-    drawing = {"settings": job.settings, "backend": job.backend, "on_event": ignore}
+    _, job = open_finished(run.path, 1, ignore)
     last = run.metrics()["stages"][-1]
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         plain, own = (
-            np.mean([m.psnr.value for m in score_views(splats, seen, **drawing).values()])  # type: ignore[arg-type]
+            np.mean([m.psnr.value for m in score_views(job, seen, ignore).values()])
             for seen in ([replace(view, appearance={}) for view in views], views)
         )
         assert last[split]["psnr"] == pytest.approx(own)

@@ -64,7 +64,7 @@ def everything(root: Path, **options: Any) -> tuple[Splats, dict[str, Any], np.n
     )
     solid = replace(trained.splats, opacity_logits=trained.splats.opacity_logits + 9)
     mesh = extract_mesh(replace(trained, splats=solid), options=MeshOptions(whole_scene=True, voxel=0.1))
-    votes = sights(trained, trained.splats)
+    votes = sights(trained)
     # SSIM looks at windows, which reach over the mask's edge on both sides alike.
     return trained.splats, {"psnr": evaluate(trained).psnr}, mesh.vertices, np.concatenate([s.points for s in votes])
 
@@ -93,24 +93,20 @@ def test_fusion_and_subject_ignore_masked_pixels(tmp_path: Path) -> None:
         return Trained(opaque, scene, protocol, settings, get_backend("cpu"))
 
     from gs2d.pipeline.finish.run_mesh import fusion_frame
-    from gs2d.render.api import rasterize
 
     view = scene.train[0]
-    with torch.no_grad():
-        output = rasterize(opaque, view.camera, job(GENERIC).settings, backend="cpu")
+    output = job(GENERIC).render(view.camera)
     assert (output.alpha > 0.9).any()
     kept = fusion_frame(job(GENERIC), view, output, "median").valid
     every = fusion_frame(job(replace(GENERIC, use_mask_in_fusion=False)), view, output, "median").valid
     assert every[:, 12:].any()
     assert not kept[:, 12:].any()
     assert np.array_equal(kept[:, :12], every[:, :12])
-    for sight in sights(job(GENERIC), opaque):
+    for sight in sights(job(GENERIC)):
         pixels, _ = sight.camera.project(sight.points)
         assert (pixels[:, 0] < sight.camera.width / 2 + 1).all()
     without = replace(GENERIC, use_mask_in_training=False)
-    assert any(
-        (s.camera.project(s.points)[0][:, 0] > s.camera.width / 2 + 1).any() for s in sights(job(without), opaque)
-    )
+    assert any((s.camera.project(s.points)[0][:, 0] > s.camera.width / 2 + 1).any() for s in sights(job(without)))
 
 
 def test_points_in_masked_pixels_only_are_not_used(tmp_path: Path) -> None:

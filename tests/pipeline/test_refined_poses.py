@@ -17,11 +17,11 @@ from gs2d.data import load_scene
 from gs2d.errors import RunError
 from gs2d.evaluation.image_metrics import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
-from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.finish.run_images import render_run, render_view
+from gs2d.pipeline.finish.evaluate import aligned, evaluate_run
+from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
-from gs2d.pipeline.prepare.learned_views import aligned, camera_motion
+from gs2d.pipeline.prepare.learned_views import camera_motion
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
 from gs2d.pipeline.prepare.options import EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.train.train_run import train
@@ -56,14 +56,14 @@ def test_the_poses_are_written_as_transforms_that_can_be_loaded(run: RunFolder, 
         (tmp_path / "again" / file).unlink()
     shutil.copy(run.file(POSES), tmp_path / "again/transforms.json")
     again = {view.name: view.camera for view in load_scene(tmp_path / "again").views}
-    _, job, _ = open_finished(run.path, 1, ignore)
+    _, job = open_finished(run.path, 1, ignore)
     for view in job.scene.views:
         np.testing.assert_allclose(again[view.name].T_cam_world, view.camera.T_cam_world, atol=1e-9)
         assert again[view.name].fx == pytest.approx(view.camera.fx)
 
 
 def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, tmp_path: Path) -> None:
-    _, job, splats = open_finished(run.path, 1, ignore)
+    _, job = open_finished(run.path, 1, ignore)
     given = load_scene(capture)
     for view, before in zip(job.scene.train, given.train, strict=True):
         assert not np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
@@ -71,16 +71,15 @@ def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, t
     for view, before in zip(job.scene.test, given.test, strict=True):
         assert np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
     # Scored while it trained, scored again, and drawn.
-    drawing = {"settings": job.settings, "backend": job.backend, "on_event": ignore}
     psnr = run.metrics()["stages"][-1]["train"]["psnr"]
-    own = mean_metrics(list(score_views(splats, job.scene.train, **drawing).values()))  # type: ignore[arg-type]
+    own = mean_metrics(list(score_views(job, job.scene.train, ignore).values()))
     assert own.to_json()["psnr"] == psnr
-    original_scores = mean_metrics(list(score_views(splats, given.train, **drawing).values()))  # type: ignore[arg-type]
+    original_scores = mean_metrics(list(score_views(job, given.train, ignore).values()))
     assert original_scores.to_json()["psnr"] != psnr
     assert evaluate_run(run.path)["train"]["psnr"] == psnr
     render_run(run.path, RenderOptions(split="train"), out=tmp_path)
     assert len(list(tmp_path.glob("*.png"))) == 6
-    texture = _views(job, TextureOptions(texture_downscale=2), ignore)
+    texture = _views(job, TextureOptions(texture_downscale=2), ignore, 1)
     assert np.array_equal(texture[0].camera.T_cam_world, job.scene.train[0].camera.T_cam_world)
     assert texture[0].camera.width == job.scene.train[0].camera.width // 2
 
@@ -97,13 +96,13 @@ def test_aligned_scores_are_added_on_request(run: RunFolder) -> None:
 
 @pytest.mark.parametrize("gain", [1.0, 0.3])
 def test_a_view_is_aligned_to_its_photograph_in_its_exposure(run: RunFolder, gain: float) -> None:
-    _, job, splats = open_finished(run.path, 1, ignore)
-    view, drawing = job.scene.train[0], (job.settings, job.backend)
-    color = render_view(splats, view, *drawing).color.clamp(0, 1).numpy()
+    _, job = open_finished(run.path, 1, ignore)
+    view = job.scene.train[0]
+    color = job.render(view.camera).color.clamp(0, 1).numpy()
     image = type(view).from_arrays("a", view.camera, np.rint(255 * gain * color).astype(np.uint8))
     image = replace(image, appearance={"exposure": gain * np.eye(3, 4)})
     off = perturb_pose(view.camera, torch.tensor([0.01, -0.01, 0, 0.01, 0.02, 0], dtype=torch.float64))
-    (found,) = aligned(splats, [image.at(off.T_cam_world)], *drawing, job.scene.extent, ignore)
+    (found,) = aligned(job, [image.at(off.T_cam_world)], ignore)
     middle = np.zeros(3)
     before, after = (camera_motion(view.camera, c, middle, job.scene.extent)["pixels"] for c in (off, found.camera))
     assert after < 0.3 * before

@@ -9,13 +9,18 @@ import numpy as np
 import pytest
 import torch
 
+from gs2d.config.protocols import GENERIC
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import mean_psnr, score_views
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
+from gs2d.training.events import ignore
+
+NO_SCENE = cast(Scene, SimpleNamespace(observed=lambda **_: None))
 
 
 def test_the_mean_psnr_of_the_curve_equals_that_of_the_full_scores() -> None:
@@ -41,13 +46,14 @@ def test_the_mean_psnr_of_the_curve_equals_that_of_the_full_scores() -> None:
         View.from_arrays("nothing counts", camera, noise, mask=np.zeros((12, 12), bool)),
         View.from_arrays("equal: infinite", away, np.zeros((12, 12, 3), np.uint8)),
     ]
-    scores = score_views(splats, views, settings, backend, lambda event: None)
+    trained = Trained(splats, NO_SCENE, GENERIC, settings, backend)
+    scores = score_views(trained, views, ignore)
     values = [scores[name].psnr_float.value for name in ("noise", "half")]
     assert [scores[view.name].psnr_float.value for view in views[2:]] == [None, None]
     assert values[0] != values[1]
-    assert mean_psnr(splats, views, settings, backend) == pytest.approx(sum(v for v in values if v) / 2, abs=0)
-    assert mean_psnr(splats, views[2:], settings, backend) is None
-    assert mean_psnr(splats, [], settings, backend) is None
+    assert mean_psnr(trained, views) == pytest.approx(sum(v for v in values if v) / 2, abs=0)
+    assert mean_psnr(trained, views[2:]) is None
+    assert mean_psnr(trained, []) is None
 
 
 def test_transparent_pixels_are_counted_where_training_photographs_are_opaque_and_unmasked() -> None:
@@ -73,8 +79,10 @@ def test_transparent_pixels_are_counted_where_training_photographs_are_opaque_an
     every, half = float(clear.mean()), float(clear[:, :6].mean())
     assert 0 < half != every
     for split in ("train", "test"):
-        counter = Collector(cast(Scene, SimpleNamespace(observed=lambda **_: None)))
-        score_views(wall, views, settings, backend, lambda _: None, split=split, visitors=[counter.visit])
+        counter = Collector(NO_SCENE)
+        score_views(
+            Trained(wall, NO_SCENE, GENERIC, settings, backend), views, ignore, split=split, visitors=[counter.visit]
+        )
         if split == "test":
             assert counter.transparent() == {}
             continue

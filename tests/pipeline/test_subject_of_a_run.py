@@ -32,16 +32,16 @@ def test_training_writes_the_subject_and_the_generic_protocol_meshes_it(undistur
     assert subject.why in str(settings_section(read_record(undisturbed.path)))
     assert subject_line(subject, meshed=True).endswith("--scene meshes everything")
     assert "everything is meshed" in subject_line(subject, meshed=False)
-    job, splats = reload_run(undisturbed, lambda _: None), finished_splats(undisturbed)
+    job = reload_run(undisturbed, lambda _: None).trained(finished_splats(undisturbed))
     assert job.protocol.name == "nerf-synthetic"
-    assert meshed_subject(undisturbed, job, splats, MeshOptions(), lambda _: None) is None
+    assert meshed_subject(undisturbed, job, MeshOptions(), lambda _: None) is None
     assert [name for name, protocol in PROTOCOLS.working() if protocol.fusion.subject] == ["generic"]
 
 
 def test_a_subject_box_becomes_the_subject_and_limits_the_mesh(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    job, splats, said = reload_run(run, lambda _: None), finished_splats(run), []
-    subject = meshed_subject(run, job, splats, MeshOptions(subject_box=BOX), said.append)
+    job, said = reload_run(run, lambda _: None).trained(finished_splats(run)), []
+    subject = meshed_subject(run, job, MeshOptions(subject_box=BOX), said.append)
     assert subject is not None
     assert (subject.kind, subject.box.ravel().tolist()) == (OBJECT, list(BOX))
     assert json.loads((run.path / "subject.json").read_text())["min"] == list(BOX[:3])
@@ -53,12 +53,12 @@ def test_a_subject_box_becomes_the_subject_and_limits_the_mesh(undisturbed: RunF
     ]
     out = tmp_path / "part.ply"
     protocol = replace(job.protocol, fusion=PROTOCOLS["generic"].fusion)
-    generic = replace(job, resolved=replace(job.resolved, protocol=protocol))
-    result = extract_mesh(generic, splats, MeshOptions(voxel=0.05), out, lambda _: None, subject=subject)
+    generic = replace(job, protocol=protocol)
+    result = extract_mesh(generic, MeshOptions(voxel=0.05), out, lambda _: None, subject=subject)
     vertices = read_mesh(out).vertices
     assert (np.abs(vertices) <= np.array(BOX[3:]) + 0.05 * 8).all()
     assert {"pixels", "faces_per_pixel"} <= result.keys()
     for options in (MeshOptions(whole_scene=True), MeshOptions(bbox=BOX), MeshOptions(method="unbounded")):
-        assert meshed_subject(run, generic, splats, options, said.append) is None
+        assert meshed_subject(run, generic, options, said.append) is None
         with pytest.raises(ProtocolError, match="exclude each other"):
-            meshed_subject(run, generic, splats, replace(options, subject_box=BOX), said.append)
+            meshed_subject(run, generic, replace(options, subject_box=BOX), said.append)

@@ -57,13 +57,13 @@ def mesh_file(
     if options.bbox is not None:
         centers_inside(splats, options.bbox, "--bbox")
     if cameras is None:
-        loaded, box = _around(splats, on_event)
+        trained, box = _around(splats, on_event)
         options = replace(options, refine=False)  # there are no photographs
     else:
-        loaded, box = _photographed(splats, Path(cameras), on_event), None
+        trained, box = _photographed(splats, Path(cameras), on_event), None
     near = None if box is None else box.ravel().tolist()
-    subject = meshed_subject(None, loaded, loaded.splats, options, on_event, box=near)
-    return extract_mesh(loaded, loaded.splats, options, out, on_event, subject=subject)
+    subject = meshed_subject(None, trained, options, on_event, box=near)
+    return extract_mesh(trained, options, out, on_event, subject=subject)
 
 
 def _photographed(splats: Splats, capture: Path, on_event: OnEvent) -> Trained:

@@ -27,7 +27,7 @@ from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.open_capture import capture_in_memory
 from gs2d.pipeline.prepare.options import MeshOptions, Training
-from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import predicted
 from gs2d.pipeline.prepare.resolve import recipe_of, resolve
 from gs2d.training.events import Event, Notice, OnEvent, Progress, StageStarted, ignore
 from gs2d.training.trainer import Trainer, raster_settings
@@ -159,12 +159,11 @@ def evaluate(
     finished = _finished(trained, scene, protocol, backend, on_event)
     if split not in ("test", "train"):
         raise DataError(f"split must be 'test' or 'train', got {split!r}")
-    drawing = (finished.settings, finished.backend)
-    scene = with_predicted(finished.scene, metered(finished.splats, *drawing))
+    scene = predicted(finished).scene
     views = scene.test if split == "test" else scene.train
     if not views:
         raise DataError(f"scene {scene.name} has no {split} views; load it with test_every=8, or use split='train'")
-    scores = score_views(finished.splats, views, *drawing, on_event, split=split, lpips=lpips)
+    scores = score_views(finished, views, on_event, split=split, lpips=lpips)
     return mean_metrics(list(scores.values()))
 
 
@@ -207,8 +206,8 @@ def extract_mesh(
             raise ProtocolError(f"voxel is set twice, to {voxel} and by options to {options.voxel}; leave one out")
         options = replace(options, voxel=voxel)
     finished = _finished(trained, scene, protocol, backend, on_event)
-    subject = meshed_subject(None, finished, finished.splats, options, ignore)
-    return fused(finished, finished.splats, options, on_event, subject=subject).mesh
+    subject = meshed_subject(None, finished, options, ignore)
+    return fused(finished, options, on_event, subject=subject).mesh
 
 
 @contextmanager

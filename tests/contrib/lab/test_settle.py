@@ -11,17 +11,20 @@ from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import GENERIC
 from gs2d.contrib.lab import settle as module
 from gs2d.contrib.lab.partition import Partition
-from gs2d.contrib.lab.settle import Settled, capture_digest, fitting_partition
+from gs2d.contrib.lab.settle import capture_digest, fitting_partition
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.estimate import Estimate, Range
+from gs2d.pipeline.prepare.loaded import loaded_run
+from gs2d.pipeline.prepare.open_capture import OpenCapture
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import get_backend
 from gs2d.training.events import Event
 from train_toys import backends, make_scene
 
 SCENE = make_scene()
-SETTLED = Settled(SCENE, get_recipe("best"), GENERIC, get_backend(backends()[-1]), "digest")
 OPTIONS = TrainOptions(scene=Path("capture"), out=Path("job"))
+CAPTURE = OpenCapture(SCENE, GENERIC, get_backend(backends()[-1]), downscale=1)
+SETTLED = loaded_run(OPTIONS, get_recipe("best"), CAPTURE, "digest", schedule_scale=1.0)
 PLAN = Estimate(start=1_000_000, max_splats=None, memory=Range(1, 2, 3), seconds=Range(1, 2, 3))
 
 

@@ -9,12 +9,14 @@ import numpy as np
 import torch
 
 from gs2d.config.presets import get_recipe
+from gs2d.config.protocols import GENERIC
 from gs2d.config.quantities import EXPOSURE
 from gs2d.contrib.lab.block_start import ABSENT, FROZEN, OWN, read_start
 from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.settle import block_recipe, budget_of, with_budget
 from gs2d.contrib.lab.split import BlockOfSplit, Split, choose_views, merge, read_split, split_model, start_file
 from gs2d.core.splats import Splats
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.events import Event, Notice, ignore
@@ -26,7 +28,7 @@ CPU = get_backend(backends()[-1])
 
 def splits(splats: Splats, folder: Path, partition: Partition, told: list[Event] | None = None) -> Split:
     on_event = ignore if told is None else told.append
-    return split_model(splats, SCENE, partition, RasterSettings(), CPU, folder, on_event)
+    return split_model(Trained(splats, SCENE, GENERIC, RasterSettings(), CPU), partition, folder, on_event)
 
 
 def test_photographs_that_show_enough_of_a_block_are_its_and_the_best_others_up_to_the_floor() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.config.recipe import Recipe
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import Recipe, validate
 from gs2d.core.atomic_files import atomic_write
+from gs2d.core.splats import Splats
+from gs2d.data import Scene
 from gs2d.data.arrays import read_npz
 from gs2d.errors import DataError, RunError
 from gs2d.io.splat_ply import read_splats
+from gs2d.pipeline.prepare.digest import scene_digest, with_priors
+from gs2d.pipeline.prepare.loaded import LoadedRun, loaded_run
+from gs2d.pipeline.prepare.open_capture import open_capture, without_masked_points
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.resolve import schedule_scale_of
+from gs2d.training.events import OnEvent
 from gs2d.training.start.initialize import splats_as_start
 from gs2d.training.trainer import TrainerOptions
 
@@ -85,3 +95,42 @@ def inside(region: tuple[tuple[Any, ...], ...], points: Tensor) -> Tensor:
     axes, low, high = (np.array(part, np.float64) for part in region)
     along = points.detach().cpu().numpy().astype(np.float64) @ axes.T
     return torch.from_numpy(((along >= low) & (along < high)).all(axis=1)).to(points.device)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainedPart:
+    """A part of a scene with its own recipe and protocol; only its splats are written."""
+
+    recipe: Recipe
+    protocol: Protocol
+    views: tuple[str, ...] = ()  # names of the training views, without test views; (): the split of the capture
+    extent: float | None = None  # world units; None: that of the capture
+    own: Splats | None = None  # the splats that are trained; None: initialised from points
+    # The frozen splats around them, the region of a dense start, and given exposures.
+    options: TrainerOptions = field(default_factory=TrainerOptions)
+    digest: str | None = None  # hash of `own` and `options`
+
+    def scene_of(self, scene: Scene) -> Scene:
+        """Return the scene with the views and the extent of the part."""
+        scene = scene if self.extent is None else replace(scene, extent=self.extent)
+        if not self.views:
+            return scene
+        by_name = {view.name: view for view in scene.train}
+        missing = [name for name in self.views if name not in by_name]
+        if missing:
+            raise DataError(
+                f"{scene.root} lacks the training view {missing[0]} of this part ({len(missing)} missing); restore the "
+                "capture, or use another --out"
+            )
+        return replace(scene, train=tuple(by_name[name] for name in self.views), test=())
+
+    def prepare(self, options: TrainOptions, on_event: OnEvent) -> LoadedRun:
+        """Read the capture and return the run of the part; options of recipe and protocol are not used."""
+        capture = open_capture(replace(options, protocol=self.protocol, test_every=None), on_event)
+        scene, scale = self.scene_of(capture.scene), schedule_scale_of(options, capture)
+        digest = scene_digest(scene, on_event, uses_masks=capture.protocol.use_mask_in_training)
+        scene = without_masked_points(scene, capture.protocol, on_event)
+        digest = with_priors(digest, scene, validate(self.recipe), on_event)
+        capture = replace(capture, scene=scene)
+        run = loaded_run(options, self.recipe, capture, digest, schedule_scale=scale, part=self.digest)
+        return replace(run, init=self.own, options=self.options)

@@ -14,20 +14,19 @@ from typing import Any
 from gs2d.config.protocols import Protocol
 from gs2d.config.serialize import decode
 from gs2d.config.serialize import from_json as recipe_from_json
-from gs2d.contrib.lab.block_start import load_start
+from gs2d.contrib.lab.block_start import TrainedPart, load_start
 from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import BlocksOptions
 from gs2d.contrib.lab.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
 from gs2d.contrib.lab.partition import Partition, from_json, make_partition
 from gs2d.contrib.lab.settle import (
-    Settled,
     block_folder,
     block_recipe,
     coarse_downscale,
     coarse_folder,
     coarse_recipe,
+    definition_of,
     fitting_partition,
-    open_settled,
     partition_folder,
     seam_folder,
     seam_recipe,
@@ -40,13 +39,12 @@ from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance
 from gs2d.pipeline.prepare.limits import use_memory, use_threads
-from gs2d.pipeline.prepare.loaded import TrainedPart, finished_splats
+from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Notice, OnEvent, ignore
-from gs2d.training.trainer import raster_settings
 
 BLOCKS_JSON = "blocks.json"  # in the run folder: the definition of the blocks
 COARSE, PARTITION, MERGE, FINISH = "coarse", "partition", "merge", "finish"
@@ -83,7 +81,7 @@ class BlocksTask(Task):
         self.limit()
         downscale = self.options.downscale if downscale is None else downscale
         options = replace(self.options, memory=self.memory, out=out, downscale=downscale)
-        return train(options, on_event, part=part)
+        return train(options, on_event, prepare=part.prepare)
 
     def limit(self) -> None:
         """Limit threads and memory to those of the task."""
@@ -94,13 +92,13 @@ class BlocksTask(Task):
         """Return the partition."""
         return from_json(settled_of(self.options.out)["partition"])
 
-    def settled(self, on_event: OnEvent) -> Settled:
+    def settled(self, on_event: OnEvent) -> LoadedRun:
         """Return what the blocks share, with the scene."""
         self.limit()
         data = settled_of(self.options.out)
         options = replace(self.options, memory=self.memory, protocol=self.protocol(), test_every=None)
-        found = open_settled(options, recipe_from_json(data["recipe"]), on_event)
-        check_capture(self.options.out, data, found.capture)
+        found = settle(options, on_event, recipe_from_json(data["recipe"]))
+        check_capture(self.options.out, data, found.resolved.scene.digest)
         return found
 
 
@@ -128,11 +126,8 @@ class PartitionTask(BlocksTask):
         make_folder(partition_folder(out))
         splats = finished_splats(coarse).to(settled.backend.device)
         found = split_model(
-            splats,
-            with_learned_appearance(coarse, settled.recipe, settled.scene),
+            settled.trained(splats, with_learned_appearance(coarse, settled.recipe, settled.scene)),
             self.partition(),
-            raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree, settled.recipe.mip_px),
-            settled.backend,
             partition_folder(out),
             on_event,
         )
@@ -281,7 +276,7 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     if partition.blocks == 1:
         return _one_training(options, training, on_event)
     use_memory(options.memory)
-    definition = settled.definition(training, partition)
+    definition = definition_of(settled, training, partition)
     if begun:
         check_same_definition(options.out, definition)
     tasks = tasks_of(replace(training, recipe="", overrides=(), resume=True), partition, share)

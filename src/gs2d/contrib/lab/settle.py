@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gs2d.config.densify import Densify
-from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import ALL, GradDensify, Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import to_json
@@ -25,10 +24,10 @@ from gs2d.core.text import name_bytes
 from gs2d.data import Scene
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.prepare.estimate import Estimate, estimate, expected_splats, limit_of
+from gs2d.pipeline.prepare.loaded import LoadedRun, loaded_run
 from gs2d.pipeline.prepare.open_capture import open_capture
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.resolve import check_options, resolve
-from gs2d.render.backends import Backend
+from gs2d.pipeline.prepare.resolve import resolve
 from gs2d.training.events import Notice, OnEvent
 
 FORMAT = 1
@@ -36,59 +35,39 @@ SEAM_RATES = 0.3  # last fraction of a block's iterations, whose learning rates 
 COARSE_PART = 3  # the coarse model has at most 1/3 of the splats that fit into memory
 
 
-@dataclass(frozen=True, eq=False)
-class Settled:
-    """What all blocks share.
+def definition_of(settled: LoadedRun, options: TrainOptions, partition: Partition) -> dict[str, Any]:
+    """Return the content of ``blocks.json``, which is compared when a run continues."""
+    capture = settled.resolved.scene
+    return {
+        "format": FORMAT,
+        "capture": {"path": str(options.scene.resolve()), "digest": capture.digest, "format": capture.format},
+        "downscale": settled.resolved.downscale,
+        "partition": partition_json(partition),
+        "recipe": to_json(settled.recipe),
+        "protocol": json.loads(json.dumps(asdict(settled.protocol))),
+        "seed": settled.recipe.seed,
+        "backend": settled.backend.name,
+    }
 
-    Attributes
-    ----------
-    recipe : Recipe
-        Recipe of one training of the whole scene.
-    protocol : Protocol
-        With near plane and background of the whole scene.
-    capture : str
-        Hash of cameras, points, and sizes and times of files, to detect changes of the capture.
+
+def settle(options: TrainOptions, on_event: OnEvent, recipe: Recipe | None = None) -> LoadedRun:
+    """Read the headers of a capture and resolve what all blocks share, with the near plane of the whole scene.
+
+    With a resolved ``recipe``, the protocol of the options is resolved, too. Nothing is written.
     """
-
-    scene: Scene
-    recipe: Recipe
-    protocol: Protocol
-    backend: Backend
-    capture: str
-
-    def definition(self, options: TrainOptions, partition: Partition) -> dict[str, Any]:
-        """Return the content of ``blocks.json``, which is compared when a run continues."""
-        return {
-            "format": FORMAT,
-            "capture": {"path": str(options.scene.resolve()), "digest": self.capture, "format": self.scene.format},
-            "downscale": (options.downscale or 1),
-            "partition": partition_json(partition),
-            "recipe": to_json(self.recipe),
-            "protocol": json.loads(json.dumps(asdict(self.protocol))),
-            "seed": self.recipe.seed,
-            "backend": self.backend.name,
-        }
-
-
-def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
-    """Read the headers of a capture and resolve what all blocks share; nothing is written."""
-    check_options(options)
     opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
     scale = 1.0 if options.schedule_scale is None else options.schedule_scale
-    recipe, resolved = resolve(options, opened, on_event, seed=options.seed, schedule_scale=scale)
-    if recipe.learns("poses"):
-        raise RecipeError(
-            "blocks need fixed cameras, got a recipe that learns poses; learn them in a run of its own, or leave poses "
-            "out of --learn"
-        )
-    protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
-    return Settled(opened.scene, recipe, protocol, opened.backend, capture_digest(opened.scene))
-
-
-def open_settled(options: TrainOptions, recipe: Recipe, on_event: OnEvent) -> Settled:
-    """Read the headers of a capture for a resolved recipe, and a resolved protocol in the options."""
-    opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
-    return Settled(opened.scene, recipe, opened.protocol, opened.backend, capture_digest(opened.scene))
+    if recipe is None:
+        recipe, resolved = resolve(options, opened, on_event, seed=options.seed, schedule_scale=scale)
+        if recipe.learns("poses"):
+            raise RecipeError(
+                "blocks need fixed cameras, got a recipe that learns poses; learn them in a run of its own, or leave "
+                "poses out of --learn"
+            )
+        protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
+        opened = replace(opened, protocol=protocol)
+    digest, title = capture_digest(opened.scene), opened.scene.name
+    return loaded_run(options, recipe, opened, digest, schedule_scale=scale, title=title)
 
 
 def capture_digest(scene: Scene) -> str:
@@ -120,13 +99,13 @@ def capture_digest(scene: Scene) -> str:
 
 # -- the grid ----------------------------------------------------------------------------------------------------------
 def fitting_partition(
-    settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent
+    settled: LoadedRun, options: TrainOptions, partition: Partition, on_event: OnEvent
 ) -> Partition | None:
     """Return the partition with as many blocks as memory needs; None if one training fits into memory."""
     found: Estimate | None = None
     recipe = settled.recipe
     try:
-        found = estimate(settled.scene, recipe, settled.backend, downscale=(options.downscale or 1))
+        found = estimate(settled.scene, recipe, settled.backend, downscale=settled.resolved.downscale)
     except DataError as error:
         on_event(Notice(f"one training does not fit: {error}"))
     if found is not None and found.max_splats is None:

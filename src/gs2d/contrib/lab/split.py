@@ -16,10 +16,9 @@ from gs2d.contrib.lab.partition import Partition
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
-from gs2d.data import Scene, View
+from gs2d.data import Scene
 from gs2d.errors import DataError, RunError
-from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.training.events import Notice, OnEvent, counted
 from gs2d.training.robust.seen_area import shown_weights, shrunk
 
@@ -97,11 +96,8 @@ def read_split(folder: Path) -> Split:
 
 
 def split_model(
-    splats: Splats,
-    scene: Scene,
+    trained: Trained,
     partition: Partition,
-    raster: RasterSettings,
-    backend: Backend,
     folder: Path,
     on_event: OnEvent,
 ) -> Split:
@@ -111,15 +107,13 @@ def split_model(
     ----------
     partition : Partition
         With a grid.
-    raster : RasterSettings
-        Settings of training.
 
     Raises
     ------
     DataError
         If no photograph shows the model.
     """
-    looks = Looks(splats, scene.train, raster, backend)
+    splats, scene, looks = trained.splats, trained.scene, Looks(trained)
     places = splats.means.detach().cpu().numpy()
     total = np.zeros(len(splats))
     for weights in counted(looks.all(), "measuring visibility", len(scene.train), on_event):
@@ -155,12 +149,9 @@ def split_model(
 
 
 def split_seams(
-    splats: Splats,
+    trained: Trained,
     split: Split,
-    scene: Scene,
     partition: Partition,
-    raster: RasterSettings,
-    backend: Backend,
     folder: Path,
     on_event: OnEvent,
 ) -> tuple[str, ...]:
@@ -171,9 +162,10 @@ def split_seams(
     tuple of str
         Photographs that show these splats with at least half of ``Partition.min_share``; () if there are none.
     """
+    splats, scene = trained.splats, trained.scene
     places, width = splats.means.detach().cpu().numpy(), partition.seam * split.cells.side
     strip = split.cells.distance_to_seam(places) < width
-    looks, shares, seen = Looks(splats, scene.train, raster, backend), [], np.zeros(len(splats), dtype=bool)
+    looks, shares, seen = Looks(trained), [], np.zeros(len(splats), dtype=bool)
     for weights in counted(looks.all(), "measuring seams", len(looks), on_event):
         shares.append(weights[strip].sum() / max(weights.sum(), LEAST_WEIGHT))
         if shares[-1] >= partition.min_share / 2:
@@ -195,13 +187,13 @@ def _exposures(scene: Scene, names: Sequence[str]) -> np.ndarray | None:
 class Looks:
     """Blending weights [N] (px, float64) of all splats in each view of a scene."""
 
-    def __init__(self, splats: Splats, views: Sequence[View], raster: RasterSettings, backend: Backend) -> None:
-        self._splats, self._views, self._raster, self._backend = splats, views, raster, backend
+    def __init__(self, trained: Trained) -> None:
+        self._trained, self._views = trained, trained.scene.train
 
     def at(self, index: int) -> np.ndarray:
         """Return the weights in a view."""
-        camera = shrunk(self._views[index].camera, SIDE)
-        found = shown_weights(self._splats, camera, self._raster, self._backend)
+        trained, camera = self._trained, shrunk(self._views[index].camera, SIDE)
+        found = shown_weights(trained.splats, camera, trained.settings, trained.backend)
         return np.asarray(found.cpu().numpy().astype(np.float64))
 
     def __len__(self) -> int:

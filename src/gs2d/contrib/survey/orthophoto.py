@@ -24,7 +24,7 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import Texels, surface_colors
 from gs2d.pipeline.finish.run_texture import photographs
-from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.loaded import Trained, open_finished
 from gs2d.training.events import OnEvent, Phase, ignore
 
 ELEVATION = "_elevation"  # appended to the name of the orthophoto
@@ -78,7 +78,7 @@ def orthophoto_run(
     mesh = read_mesh(path / MESH)
     if not len(mesh.faces):
         raise RunError(f"{path / MESH} has no triangles; extract it again with `gs2d mesh {path}`")
-    _, job, _ = open_finished(path, threads, on_event)
+    _, job = open_finished(path, threads, on_event)
     local = place.to_local(mesh.vertices)
     raster = _raster(local, options.resolution, _pixel(job, mesh) * place.scale)
     on_event(Phase("rendering from above", 0))
@@ -97,7 +97,7 @@ def orthophoto_run(
     }
 
 
-def _pixel(job: LoadedRun, mesh: Mesh) -> float:
+def _pixel(job: Trained, mesh: Mesh) -> float:
     """Return the pixel size on the surface, world units: median over the surface, by the nearest view."""
     some = mesh.vertices[:: max(1, len(mesh.vertices) // 2_000)].astype(np.float64)
     size = np.full(len(some), np.inf)
@@ -151,7 +151,7 @@ def from_above(vertices: np.ndarray, faces: np.ndarray, raster: Raster) -> Hits:
     return hits
 
 
-def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[np.ndarray, int]:
+def _colors(job: Trained, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[np.ndarray, int]:
     """Return colours [H, W, 4] uint8, alpha 0 without surface, and the number of cells that no photograph sees."""
     height, width = hits.face.shape
     index = np.flatnonzero(hits.face.reshape(-1) >= 0)

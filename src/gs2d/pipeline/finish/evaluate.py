@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from gs2d.config.recipe import LossTerm
+from gs2d.core.transforms import perturb_pose
+from gs2d.data import View
 from gs2d.errors import RunError
 from gs2d.evaluation.evaluators import check_thresholds, choose_truth, score_surface
 from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics
 from gs2d.evaluation.lpips import load_lpips
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, SURFACE, VERDICT
+from gs2d.losses.base import LossView, compute_losses
 from gs2d.pipeline.attempts import attempted_file
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.finish.scoring import RenderedPhotograph, score_views, split_metrics
-from gs2d.pipeline.prepare.learned_views import aligned, matched_by_halves
-from gs2d.pipeline.prepare.loaded import open_finished
+from gs2d.pipeline.prepare.learned_views import over, photographed
+from gs2d.pipeline.prepare.loaded import Trained, open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
-from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.training.events import Notice, OnEvent, Phase, ignore
+from gs2d.pipeline.prepare.predicted_exposure import predicted
+from gs2d.render.api import rasterize
+from gs2d.render.exposure_transform import expose, fit_exposure
+from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
+
+STEPS = 80  # of Adam, to align a test view
+RATE, RATE_FINAL = 2e-3, 2e-5  # rad and extents
+PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
 
 
 def evaluate_run(
@@ -39,38 +54,36 @@ def evaluate_run(
     path, named = Path(path), options.ground_truth
     truth = None if named is None or named.is_dir() else choose_truth(named, named.parent, tell)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
-    run, loaded, splats = open_finished(path, threads, on_event)
-    lpips = None if lpips is None else lpips.to(loaded.backend.device)
+    run, trained = open_finished(path, threads, on_event)
+    lpips = None if lpips is None else lpips.to(trained.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
-    if truth is None and loaded.scene.root is not None:
-        truth = choose_truth(named, loaded.scene.root, tell)
+    if truth is None and trained.scene.root is not None:
+        truth = choose_truth(named, trained.scene.root, tell)
     has_mesh = run.file(MESH).exists()
     if truth is not None and not has_mesh and named is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
-    drawing = (loaded.settings, loaded.backend)
-
     matched: dict[str, ImageMetrics] = {}
 
     def match(seen: RenderedPhotograph, _: ImageMetrics) -> None:
         if seen.split == "test":
-            image = matched_by_halves(seen.view, seen.output.color, seen.target, seen.mask, loaded.settings.background)
-            matched[seen.view.name] = image_metrics(image, seen.target, seen.mask, backend=loaded.backend, lpips=lpips)
+            image = matched_by_halves(seen, trained.settings.background)
+            matched[seen.view.name] = image_metrics(image, seen.target, seen.mask, backend=trained.backend, lpips=lpips)
 
-    scene, collected = with_predicted(loaded.scene, metered(splats, *drawing)), Collector(loaded.scene)
+    shown, collected = predicted(trained), Collector(trained.scene)
     visitors = [collected.visit, match] if "exposure" in wanted else [collected.visit]
-    for split, views in (("train", scene.train), ("test", scene.test)):
-        scores = score_views(splats, views, *drawing, on_event, split=split, lpips=lpips, visitors=visitors)
+    for split, views in (("train", shown.scene.train), ("test", shown.scene.test)):
+        scores = score_views(trained, views, on_event, split=split, lpips=lpips, visitors=visitors)
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
     if "exposure" in wanted:
         result |= split_metrics(matched, "test_matched", "test")
     if "poses" in wanted:
-        best = tuple(aligned(splats, scene.test, *drawing, loaded.scene.extent, on_event))
-        result |= split_metrics(score_views(splats, best, *drawing, on_event, lpips=lpips), "test_aligned", "test")
+        best = tuple(aligned(trained, shown.scene.test, on_event))
+        result |= split_metrics(score_views(trained, best, on_event, lpips=lpips), "test_aligned", "test")
     if truth is not None and has_mesh:
         mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds
         on_event(Phase("scoring the surface", 0))
-        result["surface"] = score_surface(mesh, truth, loaded.scene, folder=folder, tell=tell, thresholds=thresholds)
+        result["surface"] = score_surface(mesh, truth, trained.scene, folder=folder, tell=tell, thresholds=thresholds)
     elif truth is not None:
         on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():
@@ -79,6 +92,53 @@ def evaluate_run(
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
         with attempted_file(run, VERDICT, on_event):
-            result["verdict"] = write_verdict(run, loaded, collected)
+            result["verdict"] = write_verdict(run, trained, collected)
     report_again(run, on_event)
     return result
+
+
+def matched_by_halves(seen: RenderedPhotograph, background: tuple[float, float, float]) -> Tensor:
+    """Return a rendering with its colours matched to the photograph.
+
+    Each half gets the transform that fits the other half best (least squares), so that no pixel is matched to itself.
+    """
+    view, color, target, mask = seen.view, seen.output.color, seen.target, seen.mask
+    camera = replace(view, appearance={k: found for k, found in view.appearance.items() if k != "exposure"})
+    color, cover = photographed(camera, color, background), over(view, color, background)
+    usable = torch.ones_like(color[..., 0], dtype=torch.bool) if mask is None else mask.clone()
+    if cover:
+        usable &= cover[0] > 0
+    left = torch.zeros_like(usable)
+    left[:, : color.shape[1] // 2] = True
+    to_right = expose(color, fit_exposure(color, target, usable & left, *cover), *cover)
+    to_left = expose(color, fit_exposure(color, target, usable & ~left, *cover), *cover)
+    return torch.where(left[..., None], to_left, to_right)
+
+
+def aligned(trained: Trained, views: Sequence[View], on_event: OnEvent) -> Iterator[View]:
+    """Yield views with their cameras aligned to their photographs, by the photometric loss of the fixed splats.
+
+    Renderings have the appearance of the photographs, as far as it is known. Scores of aligned views measure the scene
+    apart from errors of its test cameras.
+    """
+    splats, settings, backend = trained.splats, trained.settings, trained.backend
+    unit = torch.tensor([1.0] * 3 + [trained.scene.extent] * 3, dtype=torch.float64)
+    for view in counted(views, "aligning cameras of test views", len(views), on_event):
+        target = torch.from_numpy(view.target(settings.background)).to(splats.means)
+        pixels = view.mask()
+        mask = None if pixels is None else torch.from_numpy(pixels).to(splats.device)
+        motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        optimizer = torch.optim.Adam([motion], lr=RATE)
+        decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATE_FINAL / RATE) ** (1 / STEPS))
+        for _ in range(STEPS):
+            camera = perturb_pose(view.camera, motion * unit)
+            output = rasterize(splats, camera, settings, backend=backend)
+            output = replace(output, color=photographed(view, output.color, settings.background))
+            compared = LossView(target, camera, mask)
+            loss = sum(compute_losses(output, compared, PHOTOMETRIC, backend=backend).values())
+            optimizer.zero_grad()
+            if isinstance(loss, torch.Tensor) and loss.requires_grad:
+                loss.backward()
+            optimizer.step()
+            decay.step()
+        yield view.at(perturb_pose(view.camera, motion.detach() * unit).T_cam_world)

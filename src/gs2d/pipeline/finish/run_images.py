@@ -29,11 +29,8 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.finish.viewpoints import orbit_cameras
 from gs2d.pipeline.prepare.learned_views import photographed
-from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished, spare_photographs
+from gs2d.pipeline.prepare.loaded import Trained, open_finished, spare_photographs
 from gs2d.pipeline.prepare.options import RenderOptions
-from gs2d.render.api import rasterize
-from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.report.color_maps import depth_image, depth_limits, error_image, highlight_image, normal_image, valid_image
 from gs2d.report.gallery import Gallery, read_gallery
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
@@ -67,14 +64,13 @@ def _short_hash(text: str) -> str:
     return hashlib.sha256(name_bytes(text)).hexdigest()[:8]
 
 
-def draw_stage(
-    run: RunFolder, loaded: LoadedRun, scene: Scene, stage: str, splats: Splats, group: Tensor | None
-) -> None:
+def draw_stage(run: RunFolder, trained: Trained, stage: str, group: Tensor | None) -> None:
     """Write the images of one stage, the photographs, and the index of both, of a few test views (or training views).
 
-    They are drawn with the appearance of their photographs, as far as ``scene`` knows it. ``group`` [N] bool are the
+    They are drawn with the appearance of their photographs, as far as the scene knows it. ``group`` [N] bool are the
     high-error splats, once they are known.
     """
+    scene, background = trained.scene, trained.settings.background
     split, every = ("test", scene.test) if scene.test else ("train", scene.train)
     count = min(SHOWN_VIEWS, len(every))
     shown = [every[(2 * i + 1) * len(every) // (2 * count)] for i in range(count)]  # evenly spaced
@@ -83,15 +79,15 @@ def draw_stage(
         make_folder(folder / name)
     drawn = read_gallery(folder) or Gallery(folder, (), ())
     limits = {view.name: view.depth_limits for view in drawn.views}
-    views, background = [], loaded.settings.background
+    views = []
     for view, file in zip(shown, file_names(shown), strict=True):
-        output = render_view(splats, view, loaded.settings, loaded.backend)
-        depth = output.depth(loaded.protocol.depth).cpu().numpy()
+        output = trained.render(view.camera)
+        depth = output.depth(trained.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
         # All stages use the limits of the first, so that they can be compared.
         near_far = limits.get(view.name)
         if near_far is None:  # from depths within reach, if there are any
-            reach = believed_reach(loaded.scene)
+            reach = believed_reach(scene)
             near = alpha if reach is None else alpha * within_reach(reach, view.camera, depth)
             near_far = depth_limits(depth, near if (near >= 0.5).any() else alpha)
         photo = view.target(background)
@@ -103,7 +99,7 @@ def draw_stage(
             "error": error_image(color, photo, view.mask()),
         }
         if group is not None:
-            fraction = splatted(splats, group, view, loaded.settings, loaded.backend)
+            fraction = splatted(trained, group, view.camera)
             images["high_error"] = highlight_image(color, fraction)
         for what, image in images.items():
             write_image(folder / stage / f"{file}.{what}.png", image)
@@ -120,21 +116,16 @@ def camera_json(camera: Camera) -> dict[str, Any]:
     return {**facts, "T_cam_world": camera.T_cam_world.tolist()}
 
 
-def render_view(splats: Splats, view: View, settings: RasterSettings, backend: Backend) -> RenderOutput:
-    """Render a view without gradients."""
-    with torch.no_grad():
-        return rasterize(splats, view.camera, settings, backend=backend)
-
-
-def splatted(splats: Splats, values: Tensor, view: View, settings: RasterSettings, backend: Backend) -> np.ndarray:
+def splatted(trained: Trained, values: Tensor, camera: Camera) -> np.ndarray:
     """Return the sum over splats of blending weight times ``values`` [N] (>= 0) in each pixel, [H, W].
 
     With a boolean row group as ``values`` this is the fraction of each pixel that the group covers.
     """
+    splats = trained.splats
     grey = values.to(splats.dtype)[:, None].expand(-1, 3)
     marked = Splats(**{**dict(splats.items()), "sh0": rgb_to_sh0(grey), "shN": torch.zeros_like(splats.shN)})
-    settings = replace(settings, background=(0.0, 0.0, 0.0))
-    return np.asarray(render_view(marked, view, settings, backend).color[..., 0].cpu().numpy())
+    drawing = replace(trained, splats=marked, settings=replace(trained.settings, background=(0.0, 0.0, 0.0)))
+    return np.asarray(drawing.render(camera).color[..., 0].cpu().numpy())
 
 
 # -- gs2d render -------------------------------------------------------------------------------------------------------
@@ -152,14 +143,14 @@ def render_run(
     path, out = Path(path), None if out is None else Path(out)
     check_frames(options)
     video = options.video
-    run, loaded, splats = open_finished(path, threads, on_event)
-    kind, views = _views(path, options, loaded, on_event)
+    run, trained = open_finished(path, threads, on_event)
+    kind, views = _views(path, options, trained.scene, on_event)
     if options.width is not None:
         views = [(name, replace(view, camera=_at_width(view.camera, options.width))) for name, view in views]
     if out is not None:
-        spare_photographs([out / f"{name}.png" for name, _ in views], "--out", loaded)
+        spare_photographs([out / f"{name}.png" for name, _ in views], "--out", trained.scene)
     if video is not None:
-        spare_photographs([video], "--video", loaded)
+        spare_photographs([video], "--video", trained.scene)
     folder = out or run.file(RENDERS) / kind
     made = make_folder(folder)
     with run.locked() if out is None else contextlib.nullcontext():
@@ -170,7 +161,7 @@ def render_run(
         written: list[Path] = []
         try:
             for name, view in counted(views, "rendering", len(views), on_event):
-                color = render_view(splats, view, loaded.settings, loaded.backend).color
+                color = trained.render(view.camera).color
                 is_new = not (folder / f"{name}.png").exists()
                 write_image(folder / f"{name}.png", color.clamp(0, 1).cpu().numpy())
                 written += [folder / f"{name}.png"] if is_new else []
@@ -191,11 +182,9 @@ def render_run(
         return result
 
 
-def _views(
-    path: Path, options: RenderOptions, loaded: LoadedRun, on_event: OnEvent
-) -> tuple[str, list[tuple[str, View]]]:
+def _views(path: Path, options: RenderOptions, scene: Scene, on_event: OnEvent) -> tuple[str, list[tuple[str, View]]]:
     """Return the name of the folder, and the views with their file names."""
-    scene, split = loaded.scene, options.split
+    split = options.split
     if options.orbit:
         subject = read_subject(path)
         focus = None if subject is None or subject.kind != OBJECT else subject.center

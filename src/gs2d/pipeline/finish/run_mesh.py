@@ -16,7 +16,6 @@ import torch
 from gs2d.core.atomic_files import disk_error
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.mesh import Mesh
-from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.reach import Reach
@@ -39,10 +38,9 @@ from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, usable_pixels, within_reach
 from gs2d.pipeline.prepare.limits import release, release_buffers
-from gs2d.pipeline.prepare.loaded import RenderedScene, checked_output, open_finished
+from gs2d.pipeline.prepare.loaded import Trained, checked_output, open_finished
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.pipeline.prepare.predicted_exposure import LUMA
-from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
@@ -63,8 +61,7 @@ LEAST_VIEWS = 2
 
 # -- extraction --------------------------------------------------------------------------------------------------------
 def extract_mesh(
-    loaded: RenderedScene,
-    splats: Splats,
+    trained: Trained,
     options: MeshOptions,
     out: Path,
     on_event: OnEvent,
@@ -77,9 +74,9 @@ def extract_mesh(
     """
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
-    result = fused(loaded, splats, options, on_event, subject=subject)
+    result = fused(trained, options, on_event, subject=subject)
     release_buffers()
-    cameras, error = [view.camera for view in loaded.scene.train], _error(loaded, options) or ERROR
+    cameras, error = [view.camera for view in trained.scene.train], _error(trained, options) or ERROR
     coarser = [result.mesh]
     for _ in range(1, options.lods):
         error *= COARSER_ERROR
@@ -99,7 +96,7 @@ def extract_mesh(
         "file": str(out),
         "vertices": len(result.mesh.vertices),
         "faces": len(result.mesh.faces),
-        "depth": options.depth or loaded.protocol.fused_depth,
+        "depth": options.depth or trained.protocol.fused_depth,
         "method": _method_name(options),
         "levels": result.levels,
         "fused_by": result.backend,
@@ -109,23 +106,21 @@ def extract_mesh(
     }
 
 
-def fused(
-    loaded: RenderedScene, splats: Splats, options: MeshOptions, on_event: OnEvent, *, subject: Subject | None = None
-) -> Extraction:
+def fused(trained: Trained, options: MeshOptions, on_event: OnEvent, *, subject: Subject | None = None) -> Extraction:
     """Fuse rendered depth of the training views; arguments as of :func:`extract_mesh`.
 
     Without a voxel size, voxels are as large as memory requires. Then photographs refine the mesh. Meshes of data sets
     stay as their protocols fuse them, unbounded ones too, whose distant faces are larger than any error of their depth,
     and watertight ones, so that they stay closed.
     """
-    if not len(splats):
+    if not len(trained.splats):
         raise ProtocolError("there are no splats to mesh; train longer or check the cameras")
     check_mesh_options(options)
-    free = options.voxel is None and loaded.protocol.fusion.voxel is None
+    free = options.voxel is None and trained.protocol.fusion.voxel is None
     chosen = options
     for attempt in range(COARSER * free + 1):
         try:
-            result = _extract(loaded, splats, chosen, on_event, subject)
+            result = _extract(trained, chosen, on_event, subject)
             break
         except VolumeTooLargeError as error:
             if attempt == COARSER * free:
@@ -144,11 +139,11 @@ def fused(
         else:
             line = f"{part} outside the fused box; --scene meshes everything, --bbox or --set depth_limit extend it"
         on_event(Notice(line))
-    if not options.refine or options.watertight or not bounded or not loaded.protocol.fusion.subject:
+    if not options.refine or options.watertight or not bounded or not trained.protocol.fusion.subject:
         return result
-    mesh = refined(loaded, result.mesh, on_event)
-    cameras = [view.camera for view in loaded.scene.train]
-    return replace(result, mesh=simplify(mesh, error=_error(loaded, options), cameras=cameras))
+    mesh = refined(trained, result.mesh, on_event)
+    cameras = [view.camera for view in trained.scene.train]
+    return replace(result, mesh=simplify(mesh, error=_error(trained, options), cameras=cameras))
 
 
 def check_mesh_options(options: MeshOptions) -> None:
@@ -174,10 +169,8 @@ def check_mesh_options(options: MeshOptions) -> None:
         raise ProtocolError(f"keep_components must be a whole number >= 0 (0 = all), got {options.keep_components}")
 
 
-def _extract(
-    loaded: RenderedScene, splats: Splats, options: MeshOptions, on_event: OnEvent, subject: Subject | None
-) -> Extraction:
-    fusion, budget = loaded.protocol.fusion, memory_budget()
+def _extract(trained: Trained, options: MeshOptions, on_event: OnEvent, subject: Subject | None) -> Extraction:
+    fusion, budget = trained.protocol.fusion, memory_budget()
     keep = fusion.clusters if options.keep_components is None else options.keep_components
     # A box or a voxel size of the user replaces all limits of the protocol.
     bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
@@ -192,14 +185,14 @@ def _extract(
         min_weight=SEVERAL if fusion.subject else 1.0,  # of one pixel
         keep=keep or None,
         by_evidence=fusion.subject,
-        error=_error(loaded, options),
+        error=_error(trained, options),
         watertight=options.watertight,
         # Slabs are fused one at a time, but joining and cleaning the surface needs about half of the whole volume.
         max_bytes=VOLUME_BYTES if budget is None else budget,
         slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
-    frames = _frames(loaded, splats, options, on_event)
-    result: Extraction = method.extract(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
+    frames = _frames(trained, options, on_event)
+    result: Extraction = method.extract(frames, chosen, threads=torch.get_num_threads(), backend=trained.backend)
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface is covered well enough"))
     return result
@@ -209,29 +202,28 @@ def _method_name(options: MeshOptions) -> str:
     return method_name(options.method, watertight=options.watertight, whole_scene=options.whole_scene)
 
 
-def _error(loaded: RenderedScene, options: MeshOptions) -> float:
+def _error(trained: Trained, options: MeshOptions) -> float:
     """Return the error of simplification, px; 0: none."""
     if options.error is not None:
         return options.error
-    return ERROR if loaded.protocol.fusion.subject else 0.0
+    return ERROR if trained.protocol.fusion.subject else 0.0
 
 
 # -- depth maps --------------------------------------------------------------------------------------------------------
-def _frames(loaded: RenderedScene, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Iterator[RenderedView]:
+def _frames(trained: Trained, options: MeshOptions, on_event: OnEvent) -> Iterator[RenderedView]:
     """Yield the input of fusion for each training view; meshes of the whole scene keep the sky."""
-    depth = options.depth or loaded.protocol.fused_depth
-    views, settings = loaded.scene.train, replace(loaded.settings, with_distortion=False).for_depths(depth)
-    reach, up = surface_reach(loaded), None if options.whole_scene else sky_direction(loaded)
+    depth = options.depth or trained.protocol.fused_depth
+    views, settings = trained.scene.train, replace(trained.settings, with_distortion=False).for_depths(depth)
+    drawing = replace(trained, settings=settings)
+    reach, up = surface_reach(trained), None if options.whole_scene else sky_direction(trained)
     for view in counted(views, "rendering depth", len(views), on_event):
-        with torch.no_grad():
-            output = rasterize(splats, view.camera, settings, backend=loaded.backend)
-        yield fusion_frame(loaded, view, output, depth, reach, up)
-    release(loaded.scene)  # decoded photographs
+        yield fusion_frame(trained, view, drawing.render(view.camera), depth, reach, up)
+    release(trained.scene)  # decoded photographs
     on_event(Phase("fusing", 0))
 
 
 def fusion_frame(
-    loaded: RenderedScene,
+    trained: Trained,
     view: View,
     output: RenderOutput,
     depth: str,
@@ -242,19 +234,19 @@ def fusion_frame(
 
     Depth beyond ``reach``, and of the sky if its direction ``up`` is known, is infinite: no surface is there.
     """
-    sky = np.zeros(output.alpha.shape, bool) if up is None else sky_of(loaded, view, up)
+    sky = np.zeros(output.alpha.shape, bool) if up is None else sky_of(trained, view, up)
     valid = (output.alpha >= OPAQUE).cpu().numpy() | sky
-    mask = view.object_mask() if loaded.protocol.use_mask_in_fusion else None
+    mask = view.object_mask() if trained.protocol.use_mask_in_fusion else None
     # Outside the photograph and in ignored pixels nothing constrains the surface.
-    for pixels in (mask, view.usable(masks=loaded.protocol.use_mask_in_fusion)):
+    for pixels in (mask, view.usable(masks=trained.protocol.use_mask_in_fusion)):
         if pixels is not None:
             valid = valid & pixels
     depths = output.depth(depth).cpu().numpy()
-    if loaded.protocol.fusion.subject:
+    if trained.protocol.fusion.subject:
         valid = valid * np.maximum(confidence(output), sky)
     past = sky if reach is None else sky | ~within_reach(reach, view.camera, depths)
     depths = np.where(past, np.float32(np.inf), depths)
-    alpha, background = output.alpha[..., None], output.color.new_tensor(loaded.settings.background)
+    alpha, background = output.alpha[..., None], output.color.new_tensor(trained.settings.background)
     color = ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)  # without the background
     return RenderedView(view.camera, depths, color.cpu().numpy(), valid)
 
@@ -282,7 +274,7 @@ def checked_mesh_file(path: Path, out: Path, options: MeshOptions) -> Path:
 
 # -- refinement --------------------------------------------------------------------------------------------------------
 def refined(
-    loaded: RenderedScene,
+    trained: Trained,
     mesh: Mesh,
     on_event: OnEvent,
     settings: RefineSettings = RefineSettings(),  # noqa: B008 (frozen)
@@ -291,13 +283,13 @@ def refined(
 
     Without two views or a surface it is returned as it is.
     """
-    views = loaded.scene.train
+    views = trained.scene.train
     if len(views) < LEAST_VIEWS or not len(mesh.faces):
         return mesh
 
     def read(index: int, factor: int) -> GreyImage:
         view = views[index]
-        small = ColorSource(view.camera, view.image(), usable_pixels(view, loaded)).shrunk(factor)
+        small = ColorSource(view.camera, view.image(), usable_pixels(trained, view)).shrunk(factor)
         grey = small.image[..., :3] @ np.asarray(LUMA, np.float32) / np.float32(255)
         return GreyImage(small.camera, np.ascontiguousarray(grey, np.float32), small.valid)
 
@@ -318,12 +310,12 @@ def mesh_run(
     """Extract the mesh of a finished run; return its file, counts and limits."""
     path, out = Path(path), None if out is None else Path(out)
     checked_mesh_file(path, path / MESH if out is None else out, options)
-    run, loaded, splats = open_finished(path, threads, on_event)
+    run, trained = open_finished(path, threads, on_event)
     own = run.file(MESH)
     target = own if out is None or out.resolve() == own.resolve() else out
     with run.locked() if target == own else nullcontext():
-        subject = meshed_subject(run, loaded, splats, options, on_event)
-        result = extract_mesh(loaded, splats, options, target, on_event, subject=subject)
+        subject = meshed_subject(run, trained, options, on_event)
+        result = extract_mesh(trained, options, target, on_event, subject=subject)
         if target != own:
             return result
         if run.metrics().get("surface"):  # scores of the previous mesh
@@ -333,7 +325,7 @@ def mesh_run(
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
             on_event(Notice(f"removed {TEXTURED}, which belonged to the previous mesh"))
-    show_again(run, on_event, loaded)
+    show_again(run, on_event, trained)
     return result
 
 

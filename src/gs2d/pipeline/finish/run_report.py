@@ -7,7 +7,7 @@ from pathlib import Path
 from gs2d.io.run_dir import PAGE, REPORT, RunFolder, open_run
 from gs2d.pipeline.attempts import attempted_file, reason_of, remade_by
 from gs2d.pipeline.look.page import page_run
-from gs2d.pipeline.prepare.loaded import LoadedRun
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.training.events import NotMade, OnEvent, ignore
 
 
@@ -30,9 +30,9 @@ def report_again(run: RunFolder, on_event: OnEvent) -> None:
         report_run(run.path, on_event)
 
 
-def show_again(run: RunFolder, on_event: OnEvent, loaded: LoadedRun | None = None) -> None:
+def show_again(run: RunFolder, on_event: OnEvent, trained: Trained | None = None) -> None:
     """Write the report again after a change, and the page, if there is one; report failures as events."""
     if run.file(PAGE).exists():
         with attempted_file(run, PAGE, on_event):
-            page_run(run.path, on_event=on_event, loaded=loaded)
+            page_run(run.path, on_event=on_event, trained=trained)
     report_again(run, on_event)

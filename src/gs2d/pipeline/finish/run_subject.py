@@ -32,9 +32,8 @@ from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.mesh_methods import MESH_METHODS
 from gs2d.pipeline.finish.trusted_depth import surface_reach
 from gs2d.pipeline.look.page import some_views
-from gs2d.pipeline.prepare.loaded import RenderedScene
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.options import MeshOptions
-from gs2d.render.api import rasterize
 from gs2d.training.events import Notice, OnEvent
 
 MAX_VIEWS = 64  # cameras that vote, evenly spaced
@@ -46,24 +45,23 @@ ENOUGH_POINTS = 20
 MAX_POINTS = 2000  # sparse points per camera
 
 
-def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | None = None) -> Subject:
+def subject_in(trained: Trained, box: Sequence[float] | None = None) -> Subject:
     """Return the subject of a scene: ``box`` (x0 y0 z0 x1 y1 z1, world units), else the one that is found.
 
     Raises ProtocolError if the box is invalid, or the splats show no surface, RunError if there is no splat in the box.
     """
     if box is not None:
-        centers_inside(splats, box, "--subject-box")
+        centers_inside(trained.splats, box, "--subject-box")
     try:
-        cameras = [view.camera for view in loaded.scene.train]
-        return find_subject(sights(loaded, splats)) if box is None else given_subject(box, cameras)
+        cameras = [view.camera for view in trained.scene.train]
+        return find_subject(sights(trained)) if box is None else given_subject(box, cameras)
     except DataError as error:
         raise ProtocolError(str(error)) from error
 
 
 def meshed_subject(
     run: RunFolder | None,
-    loaded: RenderedScene,
-    splats: Splats,
+    trained: Trained,
     options: MeshOptions,
     on_event: OnEvent,
     *,
@@ -80,13 +78,13 @@ def meshed_subject(
         f"--method {options.method}": not MESH_METHODS.get(options.method).bounded,
     }
     check_subject_box(chosen, others)
-    wanted = chosen is not None or (loaded.protocol.fusion.subject and not any(others.values()))
+    wanted = chosen is not None or (trained.protocol.fusion.subject and not any(others.values()))
     if run is None and not wanted:
         return None
     subject = read_subject(run.path) if run is not None and chosen is None else None
     if subject is None:
-        subject = subject_in(loaded, splats, chosen or (box if run is None else None))
-        on_event(Notice(subject_line(subject, meshed=chosen is not None or loaded.protocol.fusion.subject)))
+        subject = subject_in(trained, chosen or (box if run is None else None))
+        on_event(Notice(subject_line(subject, meshed=chosen is not None or trained.protocol.fusion.subject)))
         if run is not None:
             write_json(run.file(SUBJECT), subject.to_json())
     return subject if wanted and subject.kind == OBJECT else None
@@ -120,19 +118,19 @@ def subject_line(subject: Subject, *, meshed: bool) -> str:
     return f"subject: {size} world units, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
-def sights(loaded: RenderedScene, splats: Splats) -> list[Sight]:
+def sights(trained: Trained) -> list[Sight]:
     """Return the votes of some training cameras: rendered depth, and visible sparse points."""
-    points = np.zeros((0, 3)) if loaded.scene.points is None else np.asarray(loaded.scene.points.points, np.float64)
-    reach = surface_reach(loaded)
+    points = np.zeros((0, 3)) if trained.scene.points is None else np.asarray(trained.scene.points.points, np.float64)
+    reach = surface_reach(trained)
     return [
-        _sight(camera := _small(view.camera), _depth(loaded, splats, camera), points, _kept(loaded, view), reach)
-        for view in some_views(loaded.scene.train, MAX_VIEWS)
+        _sight(camera := _small(view.camera), _depth(trained, camera), points, _kept(trained, view), reach)
+        for view in some_views(trained.scene.train, MAX_VIEWS)
     ]
 
 
-def _kept(loaded: RenderedScene, view: View) -> np.ndarray | None:
+def _kept(trained: Trained, view: View) -> np.ndarray | None:
     """Return the pixels of a photograph that may vote, [H, W] bool, by its mask; None: all."""
-    used = loaded.scene.masks.found and loaded.protocol.use_mask_in_training
+    used = trained.scene.masks.found and trained.protocol.use_mask_in_training
     return view.mask() if used else None
 
 
@@ -141,10 +139,9 @@ def _small(camera: Camera) -> Camera:
     return camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
 
 
-def _depth(loaded: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
+def _depth(trained: Trained, camera: Camera) -> np.ndarray:
     """Return the median depth, which unlike the mean is on a surface; 0 where alpha is low."""
-    with torch.no_grad():
-        output = rasterize(splats, camera, loaded.settings, backend=loaded.backend)
+    output = trained.render(camera)
     return np.asarray(torch.where(output.alpha >= OPAQUE, output.depth_median, 0).cpu().numpy(), np.float64)
 
 

@@ -12,7 +12,6 @@ import torch
 from gs2d.core.atomic_files import check_writable
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
-from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.errors import ProtocolError, RunError
@@ -34,9 +33,10 @@ from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.trusted_depth import usable_pixels
 from gs2d.pipeline.prepare.learned_views import as_scene
-from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished, spare_photographs
+from gs2d.pipeline.prepare.loaded import Trained, open_finished, spare_photographs
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
+from gs2d.pipeline.prepare.resolved import read_resolved
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
 PACKAGE = "xatlas"  # of the extra `texture`
@@ -70,13 +70,13 @@ def texture_run(
     elif mesh_options != MeshOptions() or not (path / MESH).exists():
         mesh_run(path, mesh_options, on_event, threads=threads)
         mesh_options = MeshOptions()
-    run, loaded, splats = open_finished(path, threads, on_event)
-    spare_photographs(files, "--out", loaded)
-    mesh = _mesh(run, loaded, splats, mesh_options, on_event)
-    baked = textured_mesh(loaded, mesh, options, on_event)
-    write_mesh(target, baked.mesh, up=up_direction([view.camera for view in loaded.scene.train]))
+    run, trained = open_finished(path, threads, on_event)
+    spare_photographs(files, "--out", trained.scene)
+    mesh = _mesh(run, trained, mesh_options, on_event)
+    baked = textured_mesh(trained, mesh, options, on_event, downscale=read_resolved(run).downscale)
+    write_mesh(target, baked.mesh, up=up_direction([view.camera for view in trained.scene.train]))
     if target.resolve() == run.file(TEXTURED).resolve():
-        show_again(run, on_event, loaded)
+        show_again(run, on_event, trained)
     return {
         "files": [str(file) for file in files],
         "faces": len(baked.mesh.faces),
@@ -90,14 +90,19 @@ def texture_run(
     }
 
 
-def textured_mesh(loaded: LoadedRun, mesh: Mesh, options: TextureOptions, on_event: OnEvent = ignore) -> Baked:
-    """Simplify a mesh of a run, cut it into charts and colour them, with the appearance of photographs removed."""
+def textured_mesh(
+    trained: Trained, mesh: Mesh, options: TextureOptions, on_event: OnEvent = ignore, *, downscale: int | None = None
+) -> Baked:
+    """Simplify a mesh of a run, cut it into charts and colour them, with the appearance of photographs removed.
+
+    ``downscale`` is that of the views.
+    """
     on_event(Phase("cutting the surface into charts", 0))
-    views, small = _views(loaded, options, on_event), simplified(mesh, options.faces)
+    views, small = _views(trained, options, on_event, downscale), simplified(mesh, options.faces)
     if len(small.faces) > options.faces:
         on_event(Notice(f"simplified to {len(small.faces):,} triangles, the closest possible to faces={options.faces}"))
     size = options.texture_size or texture_size(small, [view.camera for view in views])
-    images = partial(photographs, loaded, views, on_event)
+    images = partial(photographs, trained, views, on_event)
     return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
 
 
@@ -111,29 +116,31 @@ def check_texture_options(options: TextureOptions) -> None:
         raise ProtocolError(f"texture_size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
 
 
-def _mesh(run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
+def _mesh(run: RunFolder, trained: Trained, options: MeshOptions, on_event: OnEvent) -> Mesh:
     """Return the mesh of the run, or one extracted with other options."""
     if options == MeshOptions() and run.file(MESH).exists():
         return read_mesh(run.file(MESH))
-    subject = meshed_subject(run, loaded, splats, options, on_event)
-    mesh = fused(loaded, splats, options, on_event, subject=subject).mesh
+    subject = meshed_subject(run, trained, options, on_event)
+    mesh = fused(trained, options, on_event, subject=subject).mesh
     trim()
     return mesh
 
 
-def _views(loaded: LoadedRun, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
+def _views(
+    trained: Trained, options: TextureOptions, on_event: OnEvent, trained_downscale: int | None
+) -> Sequence[View]:
     """Return the training views at the requested size, with refined cameras and learned appearance."""
-    scene = loaded.scene
-    if options.texture_downscale in (None, loaded.resolved.downscale) or scene.root is None:
+    scene = trained.scene
+    if options.texture_downscale in (None, trained_downscale) or scene.root is None:
         return scene.train
     downscale = options.texture_downscale or 1
-    resized = read_scene(scene.root, scene.format, downscale, loaded.protocol, on_event, scene.masks)
+    resized = read_scene(scene.root, scene.format, downscale, trained.protocol, on_event, scene.masks)
     zooms = {view.name: view.zoom for view in scene.train if view.zoom is not None}
     resized = resized.with_poses({view.name: view.camera.T_cam_world for view in scene.train}, zooms)
     return resized.with_appearance({view.name: view.appearance for view in scene.train}).train
 
 
-def photographs(loaded: LoadedRun, views: Sequence[View], on_event: OnEvent, factor: int) -> Iterator[ColorSource]:
+def photographs(trained: Trained, views: Sequence[View], on_event: OnEvent, factor: int) -> Iterator[ColorSource]:
     """Yield photographs in the colours of the scene, smaller by ``factor``."""
     for view in counted(views, PASSES[factor > 1], len(views), on_event):
-        yield ColorSource(view.camera, as_scene(view), usable_pixels(view, loaded)).shrunk(factor)
+        yield ColorSource(view.camera, as_scene(view), usable_pixels(trained, view)).shrunk(factor)

@@ -26,7 +26,7 @@ from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import VERDICT, RunFolder
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.pipeline.finish.scoring import RenderedPhotograph
-from gs2d.pipeline.prepare.loaded import LoadedRun
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.open_capture import placed_photographs
 from gs2d.render.types import RenderOutput
 from gs2d.report.sections.verdict_section import read_verdict
@@ -272,20 +272,20 @@ def _some(names: Sequence[str]) -> str:
 
 
 # -- verdict.json ------------------------------------------------------------------------------------------------------
-def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> dict[str, Any] | None:
+def write_verdict(run: RunFolder, trained: Trained, collected: Collector) -> dict[str, Any] | None:
     """Judge a run, write ``verdict.json``, and return the verdict; without newly measured views the earlier one.
 
     Raises RunError if the views were scored but never measured.
     """
     if collected.failure is not None:
         raise collected.failure
-    subject = read_subject(run.path) if loaded.protocol.fusion.subject else None
+    subject = read_subject(run.path) if trained.protocol.fusion.subject else None
     views = collected.views(subject.box if subject is not None and subject.kind == OBJECT else None)
     if not views:
         if not run.file(VERDICT).exists():
             raise RunError("the run was interrupted between scoring and measuring; `gs2d evaluate RUN` measures it")
         return read_verdict(run.path)
-    measures = Measures(views, *placed_photographs(loaded.scene.root))
+    measures = Measures(views, *placed_photographs(trained.scene.root))
     verdict = asdict(judge(measures))
     write_json(run.file(VERDICT), {"format": FORMAT, "verdict": verdict, "measured": asdict(measures)})
     return verdict

@@ -10,14 +10,12 @@ from typing import Any
 
 import torch
 
-from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics, mean_metrics, psnr_float
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.prepare.learned_views import photographed
-from gs2d.render.api import rasterize
-from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.pipeline.prepare.loaded import Trained
+from gs2d.render.types import RenderOutput
 from gs2d.training.events import OnEvent, counted
 
 
@@ -38,10 +36,8 @@ Visitor = Callable[[RenderedPhotograph, ImageMetrics], None]
 
 
 def score_views(
-    splats: Splats,
+    trained: Trained,
     views: Sequence[View],
-    settings: RasterSettings,
-    backend: Backend,
     on_event: OnEvent,
     *,
     split: str = "",
@@ -52,31 +48,28 @@ def score_views(
 
     Views are rendered with the appearance of their photographs, if known. Masked pixels are ignored.
     """
-    rendered = _rendered(splats, views, settings, backend, split)
+    rendered = _rendered(trained, views, split)
     scores: dict[str, ImageMetrics] = {}
     for seen in counted(rendered, f"scoring {split} views" if split else "scoring", len(views), on_event):
-        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=lpips)
+        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=trained.backend, lpips=lpips)
         scores[seen.view.name] = metrics
         for visit in visitors:
             visit(seen, metrics)
     return scores
 
 
-def mean_psnr(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> float | None:
+def mean_psnr(trained: Trained, views: Sequence[View]) -> float | None:
     """Return the mean PSNR of views, of images that are not rounded to 8 bits."""
-    rendered = _rendered(splats, views, settings, backend)
-    values = [psnr_float(seen.image, seen.target, seen.mask) for seen in rendered]
+    values = [psnr_float(seen.image, seen.target, seen.mask) for seen in _rendered(trained, views)]
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
 
-def _rendered(
-    splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend, split: str = ""
-) -> Iterator[RenderedPhotograph]:
-    settings = replace(settings, sh_degree=splats.sh_degree, with_distortion=False)
+def _rendered(trained: Trained, views: Sequence[View], split: str = "") -> Iterator[RenderedPhotograph]:
+    settings = replace(trained.settings, sh_degree=trained.splats.sh_degree, with_distortion=False)
+    trained = replace(trained, settings=settings)
     for view in views:
-        with torch.no_grad():
-            output = rasterize(splats, view.camera, settings, backend=backend)
+        output = trained.render(view.camera)
         target = torch.from_numpy(view.target(settings.background)).to(output.color)
         pixels = view.mask()
         mask = None if pixels is None else torch.from_numpy(pixels).to(target.device)

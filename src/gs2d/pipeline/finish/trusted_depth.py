@@ -12,7 +12,7 @@ from gs2d.data import Scene, View
 from gs2d.data.reach import Reach, reach_of
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.sky import sky_pixels
-from gs2d.pipeline.prepare.loaded import RenderedScene
+from gs2d.pipeline.prepare.loaded import Trained
 
 BEYOND = 1.25  # times the reach of a scene (``data/reach.py``); depth beyond it is ignored
 MIN_POINTS = 20  # sparse points in a photograph to search it for sky
@@ -29,9 +29,9 @@ def believed_reach(scene: Scene) -> Reach | None:
     return None if reach is None else replace(reach, radius=BEYOND * reach.radius)
 
 
-def surface_reach(loaded: RenderedScene) -> Reach | None:
+def surface_reach(trained: Trained) -> Reach | None:
     """Return the region of surfaces; None (unlimited) for protocols of data sets, which have limits of their own."""
-    return believed_reach(loaded.scene) if loaded.protocol.fusion.subject else None
+    return believed_reach(trained.scene) if trained.protocol.fusion.subject else None
 
 
 def within_reach(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray:
@@ -41,32 +41,32 @@ def within_reach(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray
     return reach.holds(places).reshape(depths.shape)
 
 
-def sky_direction(loaded: RenderedScene) -> np.ndarray | None:
+def sky_direction(trained: Trained) -> np.ndarray | None:
     """Return the up direction [3], in which sky is searched; None if the photographs are not searched.
 
     Protocols of data sets have limits of their own, and alpha channels mark what is empty.
     """
-    scene = loaded.scene
-    if not loaded.protocol.fusion.subject or scene.observed() is None or scene.train[0].alpha() is not None:
+    scene = trained.scene
+    if not trained.protocol.fusion.subject or scene.observed() is None or scene.train[0].alpha() is not None:
         return None
     return up_direction([view.camera for view in scene.train])
 
 
-def sky_of(loaded: RenderedScene, view: View, up: np.ndarray) -> np.ndarray:
+def sky_of(trained: Trained, view: View, up: np.ndarray) -> np.ndarray:
     """Return the pixels of a photograph that show sky, [H, W] bool; ``up`` [3] is the direction of the sky."""
     camera = view.camera
-    observed = loaded.scene.observed()
+    observed = trained.scene.observed()
     points = np.zeros((0, 2)) if observed is None else observed.inside(camera, min_track=2).pixels
     if len(points) < MIN_POINTS:
         return np.zeros((camera.height, camera.width), bool)
     rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
     rays = backproject(camera, np.ones(len(rows)), rows, columns) - camera.center
     above = (rays @ up > 0).reshape(camera.height, camera.width)
-    return sky_pixels(view.target(loaded.settings.background), points, above, view.valid())
+    return sky_pixels(view.target(trained.settings.background), points, above, view.valid())
 
 
-def usable_pixels(view: View, loaded: RenderedScene) -> np.ndarray | None:
+def usable_pixels(trained: Trained, view: View) -> np.ndarray | None:
     """Return the pixels that show the surface: not masked, and on the object if fusion used its mask."""
-    masks = [view.mask(), view.object_mask() if loaded.protocol.use_mask_in_fusion else None]
+    masks = [view.mask(), view.object_mask() if trained.protocol.use_mask_in_fusion else None]
     present = [mask for mask in masks if mask is not None]
     return np.logical_and.reduce(present) if present else None

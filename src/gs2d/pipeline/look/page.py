@@ -25,7 +25,7 @@ from gs2d.io.meshes import read_mesh, read_textured
 from gs2d.io.run_dir import GEOREFERENCE, MESH, PAGE, TEXTURED, RunFolder, is_run, open_run
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.web_mesh import web_mesh
-from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
+from gs2d.pipeline.prepare.loaded import Trained, finished_splats, reload_run
 from gs2d.render.types import RasterSettings
 from gs2d.report.color_maps import valid_image
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
@@ -42,18 +42,18 @@ MARGIN = 0.1  # of the longest side of that box, added on each side
 
 
 def page_run(
-    path: Path, out: Path | None = None, *, on_event: OnEvent = ignore, loaded: LoadedRun | None = None
+    path: Path, out: Path | None = None, *, on_event: OnEvent = ignore, trained: Trained | None = None
 ) -> dict[str, Any]:
     """Write the page of a run or of a file of splats; return ``file``, ``splats``, ``sh_degree``, ``views``, ``bytes``.
 
-    ``out`` is ``scene.html`` in the run, or next to the file, by default. ``loaded`` is the run, if it is in memory.
+    ``out`` is ``scene.html`` in the run, or next to the file, by default. ``trained`` is the run, if it is in memory.
     """
     path = Path(path)
     of_run = path.is_dir() or is_run(path)
     out = (path / PAGE if of_run else path.with_suffix(".html")) if out is None else Path(out)
     if out.suffix.lower() not in SUFFIXES:
         raise RunError(f"--out must name an .html file, got {out}")
-    content = page_content(path, on_event, loaded)
+    content = page_content(path, on_event, trained)
     if content.run is not None:
         content.run.sweep()
     on_event(Phase("writing the page", 0))
@@ -103,26 +103,26 @@ class PageContent:
     run: RunFolder | None  # None: the splats are of a file
 
 
-def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | None = None) -> PageContent:
-    """Return the content of the page of a run (``loaded``, if it is already loaded) or of a file of splats."""
+def page_content(path: Path, on_event: OnEvent = ignore, trained: Trained | None = None) -> PageContent:
+    """Return the content of the page of a run (``trained``, if it is in memory) or of a file of splats."""
     run = open_run(path) if path.is_dir() or is_run(path) else None
     if run is not None:
         splats = finished_splats(run)
         definition = run.definition()
         title = definition.get("title") or definition["scene"]["name"]
         try:
-            loaded = loaded or reload_run(run, on_event)
+            trained = trained or reload_run(run, on_event).trained(splats)
         except (RunError, DataError) as error:
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:
         if not path.exists():
             raise DataError(f"{path} is no run folder or file of splats{path_hint(path)}")
         splats, title = read_splats(path, lambda text: on_event(Notice(text))), path.stem
-    photographs = [] if loaded is None else some_views(loaded.scene.train)
+    photographs = [] if trained is None else some_views(trained.scene.train)
     scene = page_scene(
         title,
         photographs,
-        settings_without_run(splats) if loaded is None else loaded.settings,
+        settings_without_run(splats) if trained is None else trained.settings,
         splats.means.cpu().numpy(),
         subject=None if run is None else _subject(path, on_event),
         world=None if run is None else _world_of(run, on_event),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +10,14 @@ import torch
 from torch import Tensor
 
 from gs2d.config.quantities import QUANTITIES
-from gs2d.config.recipe import LossTerm, Recipe
+from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera, Zoom
 from gs2d.core.json_files import read_json, write_json
-from gs2d.core.splats import Splats
-from gs2d.core.transforms import focus_point, perturb_pose
+from gs2d.core.transforms import focus_point
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import LEARNED, POSES, SPLATS, RunFolder
-from gs2d.losses.base import LossView, compute_losses
-from gs2d.render.api import rasterize
-from gs2d.render.backends import Backend
-from gs2d.render.exposure_transform import expose, fit_exposure
-from gs2d.render.types import RasterSettings
-from gs2d.training.events import Notice, OnEvent, counted
+from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.appearance import numbers_of, shown, unshown
 from gs2d.training.learned.image_exposure import exposure_gain
 from gs2d.training.learned.quantity import ImagePoints
@@ -42,9 +34,6 @@ CAMERAS = (
 )
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GRID = 5  # points along each side of an image, by which motion is measured
-STEPS = 80  # of Adam, to align a test view
-RATE, RATE_FINAL = 2e-3, 2e-5  # rad and extents
-PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
 
 
 # -- appearance --------------------------------------------------------------------------------------------------------
@@ -109,27 +98,6 @@ def as_scene(view: View) -> np.ndarray:
     back, result = unshown(color, numbers_of(view, color), ImagePoints(view.camera)), image.copy()
     result[..., :3] = np.rint(255 * np.clip(back.numpy(), 0, 1))
     return result
-
-
-def matched_by_halves(
-    view: View, color: Tensor, target: Tensor, mask: Tensor | None, background: tuple[float, float, float]
-) -> Tensor:
-    """Return a rendering with its colours matched to the photograph.
-
-    Each half gets the transform that fits the other half best (least squares), so that no pixel is matched to itself.
-    ``color`` and ``target`` [H, W, 3] are rendering and photograph over the background; False in ``mask`` [H, W]:
-    ignore this pixel.
-    """
-    camera = replace(view, appearance={k: found for k, found in view.appearance.items() if k != "exposure"})
-    color, cover = photographed(camera, color, background), over(view, color, background)
-    usable = torch.ones_like(color[..., 0], dtype=torch.bool) if mask is None else mask.clone()
-    if cover:
-        usable &= cover[0] > 0
-    left = torch.zeros_like(usable)
-    left[:, : color.shape[1] // 2] = True
-    to_right = expose(color, fit_exposure(color, target, usable & left, *cover), *cover)
-    to_left = expose(color, fit_exposure(color, target, usable & ~left, *cover), *cover)
-    return torch.where(left[..., None], to_left, to_right)
 
 
 def over(view: View, color: Tensor, background: tuple[float, float, float]) -> tuple[Tensor, ...]:
@@ -226,33 +194,3 @@ def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
         if view.name not in poses or (recipe.learns("intrinsics") and view.name not in zooms):
             raise RunError(f"{run.file(POSES)} lacks pose or zoom of {view.name}; {remedy}")
     return refined
-
-
-def aligned(
-    splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend, extent: float, on_event: OnEvent
-) -> Iterator[View]:
-    """Yield views with their cameras aligned to their photographs, by the photometric loss of the fixed splats.
-
-    Renderings have the appearance of the photographs, as far as it is known. Scores of aligned views measure the scene
-    apart from errors of its test cameras.
-    """
-    for view in counted(views, "aligning cameras of test views", len(views), on_event):
-        target = torch.from_numpy(view.target(settings.background)).to(splats.means)
-        pixels = view.mask()
-        mask = None if pixels is None else torch.from_numpy(pixels).to(splats.device)
-        unit = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
-        motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-        optimizer = torch.optim.Adam([motion], lr=RATE)
-        decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATE_FINAL / RATE) ** (1 / STEPS))
-        for _ in range(STEPS):
-            camera = perturb_pose(view.camera, motion * unit)
-            output = rasterize(splats, camera, settings, backend=backend)
-            output = replace(output, color=photographed(view, output.color, settings.background))
-            compared = LossView(target, camera, mask)
-            loss = sum(compute_losses(output, compared, PHOTOMETRIC, backend=backend).values())
-            optimizer.zero_grad()
-            if isinstance(loss, torch.Tensor) and loss.requires_grad:
-                loss.backward()
-            optimizer.step()
-            decay.step()
-        yield view.at(perturb_pose(view.camera, motion.detach() * unit).T_cam_world)

@@ -7,14 +7,15 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from gs2d.config.protocols import Protocol
-from gs2d.config.recipe import Recipe, validate
+from gs2d.config.recipe import Recipe
+from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data import Scene
-from gs2d.data.known_captures import missing_lines
 from gs2d.errors import DataError, RunError
 from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import read_surfels
@@ -22,12 +23,13 @@ from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
 from gs2d.pipeline.prepare.digest import scene_digest, with_priors
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_refined_poses
 from gs2d.pipeline.prepare.limits import use_threads
-from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
+from gs2d.pipeline.prepare.open_capture import OpenCapture, open_capture, read_scene
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options, resolve, schedule_scale_of
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
+from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend, get_backend
-from gs2d.render.types import RasterSettings
+from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.trainer import TrainerOptions, raster_settings
 
@@ -58,6 +60,10 @@ class LoadedRun:
     def settings(self) -> RasterSettings:
         """The constants of the rasterizer."""
         return self.resolved.raster
+
+    def trained(self, splats: Splats, scene: Scene | None = None) -> Trained:
+        """Return the result of training: splats, and the scene with what was learned of its views."""
+        return Trained(splats, scene or self.scene, self.protocol, self.settings, self.backend, self.recipe)
 
     def stage_key(self, index: int, processes: Sequence[tuple[int, ...]] | None = None) -> str:
         """Return a hash of everything that determines the bytes of the state at the end of stage ``index``.
@@ -102,83 +108,42 @@ class Trained:
     backend: Backend
     recipe: Recipe | None = None
 
-
-RenderedScene = LoadedRun | Trained
-"""A scene, and how its splats are rendered."""
+    def render(self, camera: Camera) -> RenderOutput:
+        """Render the image of a camera, without gradients."""
+        with torch.no_grad():
+            return rasterize(self.splats, camera, self.settings, backend=self.backend)
 
 
 # -- before training ---------------------------------------------------------------------------------------------------
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrainedPart:
-    """A part of a scene with its own recipe and protocol; only its splats are written."""
-
-    recipe: Recipe
-    protocol: Protocol
-    views: tuple[str, ...] = ()  # names of the training views, without test views; (): the split of the capture
-    extent: float | None = None  # world units; None: that of the capture
-    own: Splats | None = None  # the splats that are trained; None: initialised from points
-    # The frozen splats around them, the region of a dense start, and given exposures.
-    options: TrainerOptions = field(default_factory=TrainerOptions)
-    digest: str | None = None  # hash of `own` and `options`
-
-    def scene_of(self, scene: Scene) -> Scene:
-        """Return the scene with the views and the extent of the part."""
-        scene = scene if self.extent is None else replace(scene, extent=self.extent)
-        if not self.views:
-            return scene
-        by_name = {view.name: view for view in scene.train}
-        missing = [name for name in self.views if name not in by_name]
-        if missing:
-            raise DataError(
-                f"{scene.root} lacks the training view {missing[0]} of this part ({len(missing)} missing); restore the "
-                "capture, or use another --out"
-            )
-        return replace(scene, train=tuple(by_name[name] for name in self.views), test=())
-
-
-def prepare_run(
-    options: TrainOptions, on_event: OnEvent, *, title: str = "", part: TrainedPart | None = None
-) -> LoadedRun:
-    """Check the options, read the capture and resolve the run. Writes nothing.
-
-    ``title`` is the heading of the report; empty: the name of the capture. A ``part`` of the scene has its own recipe
-    and protocol, instead of those of the options.
-    """
-    if part is None:
-        check_options(options)
-    else:
-        options = replace(options, protocol=part.protocol, test_every=None)
-    init, init_digest = (None, None) if options.init is None else read_init(options.init, on_event)
-    init = init if part is None else part.own
-    capture = open_capture(options, on_event)
-    scene = capture.scene if part is None else part.scene_of(capture.scene)
-    missing = missing_lines(options.scene)
-    for line in missing[:SHOWN_SKIPS]:
-        on_event(Notice(line))
-    if len(missing) > SHOWN_SKIPS:
-        on_event(Notice(f"{len(missing) - SHOWN_SKIPS} more files are missing; `gs2d info` lists them"))
-    digest = scene_digest(scene, on_event, uses_masks=capture.protocol.use_mask_in_training)
-    capture, scale = replace(capture, scene=scene), schedule_scale_of(options, capture)
-    if part is None:
-        recipe, capture = resolve(options, capture, on_event, seed=options.seed, schedule_scale=scale)
-    else:
-        recipe = validate(part.recipe)
-        capture = replace(capture, scene=without_masked_points(scene, capture.protocol, on_event))
+def loaded_run(options: TrainOptions, recipe: Recipe, capture: OpenCapture, digest: str, **facts: Any) -> LoadedRun:
+    """Return the run of a recipe on a capture with this digest; ``facts`` are further fields of ``ResolvedRun``."""
     resolved = ResolvedRun(
         recipe=recipe,
         protocol=capture.protocol,
-        scene=CaptureRecord.of(capture.scene, with_priors(digest, capture.scene, recipe, on_event)),
+        scene=CaptureRecord.of(capture.scene, digest),
         downscale=capture.downscale,
         raster=raster_settings(capture.protocol, capture.scene.extent, recipe.sh_degree, recipe.mip_px),
         backend=capture.backend.facts(),
-        schedule_scale=scale,
-        title=title,
-        init=init_digest,
-        part=None if part is None else part.digest,
         execution=Execution(**values(Execution, options)),
+        **facts,
     )
-    further = TrainerOptions() if part is None else part.options
-    return LoadedRun(resolved, capture.scene, capture.backend, init, further)
+    return LoadedRun(resolved, capture.scene, capture.backend)
+
+
+def prepare_run(options: TrainOptions, on_event: OnEvent, *, title: str = "") -> LoadedRun:
+    """Check the options, read the capture and resolve the run. Writes nothing.
+
+    ``title`` is the heading of the report; empty: the name of the capture.
+    """
+    check_options(options)
+    init, init_digest = (None, None) if options.init is None else read_init(options.init, on_event)
+    capture = open_capture(options, on_event)
+    digest = scene_digest(capture.scene, on_event, uses_masks=capture.protocol.use_mask_in_training)
+    scale = schedule_scale_of(options, capture)
+    recipe, capture = resolve(options, capture, on_event, seed=options.seed, schedule_scale=scale)
+    digest = with_priors(digest, capture.scene, recipe, on_event)
+    run = loaded_run(options, recipe, capture, digest, schedule_scale=scale, title=title, init=init_digest)
+    return replace(run, init=init)
 
 
 def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
@@ -229,13 +194,13 @@ def finished_splats(run: RunFolder) -> Splats:
     return splats
 
 
-def open_finished(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, LoadedRun, Splats]:
-    """Return a finished run, loaded, with its splats on the device of its backend."""
+def open_finished(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Trained]:
+    """Return a finished run with its splats on the device of its backend."""
     use_threads(threads)
     run = open_run(path)
     splats = finished_splats(run)
     loaded = reload_run(run, on_event)
-    return run, loaded, splats.to(loaded.backend.device)
+    return run, loaded.trained(splats.to(loaded.backend.device))
 
 
 def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "the file") -> Path:
@@ -248,9 +213,9 @@ def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "the
     return out
 
 
-def spare_photographs(files: Iterable[Path], option: str, loaded: LoadedRun) -> None:
+def spare_photographs(files: Iterable[Path], option: str, scene: Scene) -> None:
     """Raise if an output would overwrite a photograph of the capture."""
-    images = {view.path.resolve() for view in loaded.scene.views if view.path is not None}
+    images = {view.path.resolve() for view in scene.views if view.path is not None}
     for file in files:
         if file.resolve() in images:
             raise RunError(f"{option} would overwrite the photograph {file}; choose another name")

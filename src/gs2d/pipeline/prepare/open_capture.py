@@ -13,7 +13,7 @@ import torch
 from gs2d.config.protocols import Protocol, get_protocol, protocol_for
 from gs2d.core.json_files import read_json
 from gs2d.data import Scene, detect_format, load_scene
-from gs2d.data.known_captures import protocol_of
+from gs2d.data.known_captures import missing_lines, protocol_of
 from gs2d.data.load import reader_of
 from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.scene import PointCloud, View
@@ -100,6 +100,11 @@ def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
             scene = load(fitting, f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")
     for event in notices:
         on_event(event)
+    missing = missing_lines(options.scene)
+    for line in missing[:SHOWN_SKIPS]:
+        on_event(Notice(line))
+    if len(missing) > SHOWN_SKIPS:
+        on_event(Notice(f"{len(missing) - SHOWN_SKIPS} more files are missing; `gs2d info` lists them"))
     check_memory(scene, downscale, on_host=backend.on_host)
     if options.test_every is not None and scene.own_split:
         raise ProtocolError(f"--test-every: {options.scene} has a split of its own; leave the option out")

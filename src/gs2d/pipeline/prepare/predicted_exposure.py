@@ -9,18 +9,16 @@ photographs are not used.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 
 from gs2d.core.camera import Camera
-from gs2d.core.splats import Splats
 from gs2d.data import Scene, View
-from gs2d.render.api import rasterize
-from gs2d.render.backends import Backend
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.render.exposure_transform import identity
-from gs2d.render.types import RasterSettings
 
 NEIGHBOURS = 5  # training photographs used by a prediction
 CLOSE = 0.02  # added to distances, in extents
@@ -32,29 +30,27 @@ LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 DARK = 0.02  # added to a brightness before its logarithm
 LEAST_GAIN = 0.05
 
-Brightness = Callable[[View], float]
+
+def brightness(trained: Trained, view: View) -> float:
+    """Return the brightness of a view: the mean of its rendering in the mean exposure."""
+    camera = view.camera
+    small = METERED / max(camera.width, camera.height)
+    if small < 1:
+        camera = camera.resized(max(1, round(small * camera.width)), max(1, round(small * camera.height)))
+    color = trained.render(camera).color
+    return float((color.clamp_min(0).mean(dim=(0, 1)).double().cpu() * torch.tensor(LUMA).double()).sum())
 
 
-def metered(splats: Splats, settings: RasterSettings, backend: Backend) -> Brightness:
-    """Return a function that measures the brightness of a view: the mean of its rendering in the mean exposure."""
-
-    def brightness(view: View) -> float:
-        camera = view.camera
-        small = METERED / max(camera.width, camera.height)
-        if small < 1:
-            camera = camera.resized(max(1, round(small * camera.width)), max(1, round(small * camera.height)))
-        with torch.no_grad():
-            color = rasterize(splats, camera, settings, backend=backend).color
-        return float((color.clamp_min(0).mean(dim=(0, 1)).double().cpu() * torch.tensor(LUMA).double()).sum())
-
-    return brightness
+def predicted(trained: Trained) -> Trained:
+    """Return the result of training with predicted exposures of test views (:func:`with_predicted`)."""
+    return replace(trained, scene=with_predicted(trained.scene, partial(brightness, trained)))
 
 
-def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
+def with_predicted(scene: Scene, brightness: Callable[[View], float] | None = None) -> Scene:
     """Return a scene with predicted exposures of test views; unchanged if training views have none.
 
-    The scene has the learned appearance of its training views. ``brightness`` is that of :func:`metered`; without it
-    only neighbours are used.
+    The scene has the learned appearance of its training views. Without the ``brightness`` of views only neighbours are
+    used.
     """
     if not scene.test or any("exposure" not in view.appearance for view in scene.train):
         return scene
@@ -68,7 +64,7 @@ def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
     if brightness is not None and len(cameras) >= ENOUGH:
         seen = np.array([brightness(view) for view in scene.train])
         meter = _Meter.fitted(seen, 1 + greys / GREY, around, trust)
-    predicted = {}
+    found = {}
     for view in scene.test:
         weights = _weights(view.camera, cameras, scene.extent)
         mean = (torch.from_numpy(weights)[:, None, None] * offsets).sum(dim=0)
@@ -76,8 +72,8 @@ def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
         if meter is not None and brightness is not None:
             own = 1 + float((GREY * transform[:, :3].sum(dim=1) + transform[:, 3] - GREY).mean()) / GREY
             transform = transform * (meter.gain(brightness(view), weights) / max(own, LEAST_GAIN))
-        predicted[view.name] = {"exposure": transform.numpy()}
-    return scene.with_appearance(predicted)
+        found[view.name] = {"exposure": transform.numpy()}
+    return scene.with_appearance(found)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from dataclasses import asdict
 from typing import Any
 
 from gs2d.config.recipe import Stage
-from gs2d.data import Scene
 from gs2d.errors import DivergedError, Gs2dError
 from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
@@ -20,8 +19,8 @@ from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import mean_psnr, peak_memory, score_views, split_metrics
 from gs2d.pipeline.prepare.learned_views import write_appearance, write_poses
 from gs2d.pipeline.prepare.limits import release_buffers
-from gs2d.pipeline.prepare.loaded import LoadedRun
-from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.loaded import LoadedRun, Trained
+from gs2d.pipeline.prepare.predicted_exposure import predicted, with_predicted
 from gs2d.pipeline.prepare.resolve import checkpoint_interval
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.resume import put_in_cache
@@ -78,7 +77,7 @@ class RunLogger:
     ) -> None:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
         self._collected = collected
-        self._predicted: tuple[tuple[int, int], Scene] | None = None  # with its stage and step
+        self._predicted: tuple[tuple[int, int], Trained] | None = None  # with its stage and step
         self._progress_every = progress_every(loaded)
         self._checkpoint_interval = checkpoint_interval(loaded.resolved.execution.checkpoint_every)
         self._clock = StageClock(seconds)
@@ -214,7 +213,7 @@ class RunLogger:
         scene = with_predicted(self._trainer.scene_now())
         probes = scene.test or scene.train
         probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
-        return mean_psnr(self._trainer.drawn, probes, self._loaded.settings, self._loaded.backend)
+        return mean_psnr(self._loaded.trained(self._trainer.drawn, scene), probes)
 
     def score(self, index: int, facts: Mapping[str, Any]) -> None:
         """Score and draw a finished stage; ``facts`` go into its entry. After the last stage, errors are reported."""
@@ -264,12 +263,10 @@ class RunLogger:
         for split in ("train", "test"):
             entry |= {split: None, f"{split}_reason": "its views could not be scored"}
             with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
-                scene, loaded = self._shown_scene(), self._loaded
-                views, drawing = scene.train if split == "train" else scene.test, (loaded.settings, loaded.backend)
+                shown = self._shown()
+                views = shown.scene.train if split == "train" else shown.scene.test
                 visitors = [] if collected is None else [collected.visit]
-                scores = score_views(
-                    self._trainer.drawn, views, *drawing, self._on_event, split=split, visitors=visitors
-                )
+                scores = score_views(shown, views, self._on_event, split=split, visitors=visitors)
                 del entry[f"{split}_reason"]
                 entry |= split_metrics(scores, split)
         entry |= {} if collected is None else collected.transparent()
@@ -286,14 +283,14 @@ class RunLogger:
         drawn, state = self._trainer.drawn, self._trainer.state
         with attempted(f"images of stage {stage}", None, self._on_event):
             group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # no frozen splats
-            draw_stage(self._run, self._loaded, self._shown_scene(), stage, drawn, group)
+            draw_stage(self._run, self._shown(), stage, group)
 
-    def _shown_scene(self) -> Scene:
-        """Return the scene with its learned appearance, and predicted exposures of its test views."""
+    def _shown(self) -> Trained:
+        """Return the splats with the learned appearance of the scene, and predicted exposures of its test views."""
         at = (self._trainer.state.stage, self._trainer.state.step)
         if self._predicted is None or self._predicted[0] != at:
-            brightness = metered(self._trainer.drawn, self._loaded.settings, self._loaded.backend)
-            self._predicted = (at, with_predicted(self._trainer.scene_now(), brightness))
+            now = self._loaded.trained(self._trainer.drawn, self._trainer.scene_now())
+            self._predicted = (at, predicted(now))
         return self._predicted[1]
 
     # -- helpers -------------------------------------------------------------------------------------------------------

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 
 from gs2d.core.memory import hold
-from gs2d.core.splats import Splats
-from gs2d.data.scene import Scene
 from gs2d.errors import RunError
 from gs2d.io.run_dir import (
     EDITS,
@@ -31,7 +29,7 @@ from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
 from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
-from gs2d.pipeline.prepare.loaded import LoadedRun, TrainedPart, prepare_run
+from gs2d.pipeline.prepare.loaded import LoadedRun, Trained, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.live import Live
@@ -51,7 +49,7 @@ def train(
     *,
     title: str = "",
     allowed: tuple[str, ...] = (),
-    part: TrainedPart | None = None,
+    prepare: Callable[[TrainOptions, OnEvent], LoadedRun] | None = None,
 ) -> RunFolder:
     """Train a run and write splats, mesh, metrics, page and report.
 
@@ -67,8 +65,8 @@ def train(
         Heading of the report; empty: the name of the capture.
     allowed : tuple of str
         Names of files that may already be in ``options.out``.
-    part : TrainedPart or None
-        Trains a part of the scene and writes its splats only.
+    prepare : callable, optional
+        Makes the run from the options, for a part of a scene, whose splats only are written.
 
     Returns
     -------
@@ -87,7 +85,7 @@ def train(
             heard.append(event)
             on_event(event)
 
-        loaded = prepare_run(options, listen, title=title, part=part)
+        loaded = prepare_run(options, listen, title=title) if prepare is None else prepare(options, listen)
         run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
         with (
             run.locked(),
@@ -114,7 +112,7 @@ def train(
             start = choose_start(run, loaded, tell)
             if start[0] is None:
                 tell(Notice(_training_line(loaded)))
-                if part is None:
+                if prepare is None:
                     known = None if loaded.init is None else len(loaded.init)
                     shrunk = loaded.resolved.downscale
                     needed = estimate(loaded.scene, loaded.recipe, loaded.backend, downscale=shrunk, start=known)
@@ -123,11 +121,11 @@ def train(
                     if isinstance(event, Notice) and event.detail:
                         run.events.append({"kind": Notice.kind, "text": event.text})
             hold()
-            collected = Collector(loaded.scene) if part is None else None
-            splats, now = train_stages(run, loaded, start, tell, collected, together, live)
+            collected = Collector(loaded.scene) if prepare is None else None
+            trained = train_stages(run, loaded, start, tell, collected, together, live)
             release(loaded.scene)  # before the volume of the mesh
             if collected is not None:
-                finish(run, replace(loaded, scene=now), splats, tell, collected)
+                finish(run, trained, tell, collected, page=options.page)
         return run
 
 
@@ -159,8 +157,8 @@ def train_stages(
     collected: Collector | None,
     together: OneProcess,
     live: Live | None,
-) -> tuple[Splats, Scene]:
-    """Train from ``start`` (:func:`choose_start`) to the end; return the splats, and the scene with refined cameras.
+) -> Trained:
+    """Train from ``start`` (:func:`choose_start`) to the end; return splats, and the scene with refined cameras.
 
     The splats are written before they are scored. ``collected`` measures every view of the finished splats.
     """
@@ -192,7 +190,7 @@ def train_stages(
     recorder.begin()
     with recorder.ending_well():
         trainer.run()
-    return trainer.splats, trainer.scene_now()
+    return loaded.trained(trainer.splats, trainer.scene_now())
 
 
 def _training_line(loaded: LoadedRun) -> str:
@@ -211,17 +209,17 @@ def _training_line(loaded: LoadedRun) -> str:
     )
 
 
-def finish(run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent, collected: Collector) -> None:
+def finish(run: RunFolder, trained: Trained, on_event: OnEvent, collected: Collector, *, page: bool) -> None:
     """Write mesh, page, verdict and report of a run; a failure of one does not prevent the others."""
     mesh = MeshOptions()
     with attempted_file(run, MESH, on_event):
-        subject = meshed_subject(run, loaded, splats, mesh, on_event)
+        subject = meshed_subject(run, trained, mesh, on_event)
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
-            keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject))
-    if loaded.resolved.execution.page and not run.file(PAGE).exists():
+            keep_facts(run, extract_mesh(trained, mesh, run.file(MESH), on_event, subject=subject))
+    if page and not run.file(PAGE).exists():
         with attempted_file(run, PAGE, on_event):
-            page_run(run.path, on_event=on_event, loaded=loaded)
+            page_run(run.path, on_event=on_event, trained=trained)
     with attempted_file(run, VERDICT, on_event):
-        write_verdict(run, loaded, collected)
+        write_verdict(run, trained, collected)
     on_event(Phase("writing the report", 0))  # last: it links to the others
     report_again(run, on_event)
