@@ -192,10 +192,7 @@ _BY_FORMAT = MappingProxyType({"blender": NERF_SYNTHETIC, "dtu": DTU})
 def get_protocol(name: str) -> Protocol:
     """Return the protocol of a name.
 
-    Raises
-    ------
-    ProtocolError
-        If there is no protocol of this name; lists the names.
+    Raises ProtocolError if there is no protocol of this name; lists the names.
     """
     if name not in PROTOCOLS:
         raise ProtocolError(PROTOCOLS.unknown(name, also=("auto",)))

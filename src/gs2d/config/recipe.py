@@ -377,10 +377,7 @@ class Recipe:
 def validate(recipe: Recipe) -> Recipe:
     """Check that a recipe can be trained, and return it.
 
-    Raises
-    ------
-    RecipeError
-        Names the stage, the value and what was expected.
+    The RecipeError names the stage, the value and what was expected.
     """
     where = f"recipe {recipe.name!r}"
     require(bool(recipe.stages), f"{where}: expected at least one stage, got none")

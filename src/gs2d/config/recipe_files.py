@@ -33,10 +33,7 @@ def short_name(name: str) -> str:
 def read_recipe_file(name: str) -> Recipe:
     """Read ``file.json``, or run ``file.py`` once and return its recipe ``name``.
 
-    Raises
-    ------
-    RecipeError
-        If the file does not exist, cannot be read or run, or has no recipe of this name.
+    Raises RecipeError if the file does not exist, cannot be read or run, or has no recipe of this name.
     """
     if name.endswith(".json"):
         return _from_json_file(Path(name))
@@ -65,10 +62,7 @@ def read_recipe_file(name: str) -> Recipe:
 def made_recipe(found: Any, where: str) -> Recipe:
     """Return a recipe, or the result of a function without arguments, validated.
 
-    Raises
-    ------
-    RecipeError
-        If the result is no recipe.
+    Raises RecipeError if the result is no recipe.
     """
     try:
         value = found() if callable(found) else found

@@ -31,17 +31,8 @@ MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a typing error
 def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
     """Return a recipe with a schedule ``factor`` times as long.
 
-    Parameters
-    ----------
-    recipe : Recipe
-    factor : float
-        Positive. The number of random points to start from shrinks with its square root, to 10 000 at least, because a
-        short run cannot place as many splats.
-
-    Raises
-    ------
-    RecipeError
-        If the factor is not in (0, ``MAX_SCALE``].
+    ``factor``: positive. The number of random points to start from shrinks with its square root, to 10 000 at least,
+    because a short run cannot place as many splats. Raises RecipeError if the factor is not in (0, ``MAX_SCALE``].
     """
     if not 0 < factor <= MAX_SCALE:
         raise RecipeError(f"--schedule-scale must be a positive number up to {MAX_SCALE:g}, got {factor}")
@@ -51,16 +42,8 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
 def fit_schedule(recipe: Recipe, iterations: int) -> Recipe:
     """Return a recipe with a total of ``iterations``, scaled like :func:`scale_schedule`.
 
-    Parameters
-    ----------
-    recipe : Recipe
-    iterations : int
-        Total of all stages. Each stage keeps its fraction of them, to within one, and at least one.
-
-    Raises
-    ------
-    RecipeError
-        If there are fewer iterations than stages, or more than ``MAX_SCALE`` times those of the recipe.
+    ``iterations``: total of all stages. Each stage keeps its fraction of them, to within one, and at least one. Raises
+    RecipeError if there are fewer iterations than stages, or more than ``MAX_SCALE`` times those of the recipe.
     """
     lengths = [stage.iterations for stage in recipe.stages]
     least, most = sum(length > 0 for length in lengths), round(MAX_SCALE * recipe.iterations)

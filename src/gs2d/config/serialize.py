@@ -31,12 +31,8 @@ def to_json(recipe: Recipe) -> dict[str, Any]:
 def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
     """Return the recipe of a result of :func:`to_json`, validated.
 
-    For a finished run (``to_train`` False), losses and densifiers of plug-ins may be missing.
-
-    Raises
-    ------
-    RecipeError
-        If a key is unknown or missing, or a value has another type.
+    For a finished run (``to_train`` False), losses and densifiers of plug-ins may be missing. Raises RecipeError if a
+    key is unknown or missing, or a value has another type.
     """
     with nullcontext() if to_train else absent_guests():
         recipe = decode(data, Recipe, "recipe")
@@ -47,26 +43,17 @@ def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
 def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     """Change fields of a recipe.
 
-    Parameters
-    ----------
-    recipe : Recipe
-    overrides : sequence of str
-        ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Dots reach deeper fields:
-        ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
-        ``surface.losses.normal_consistency.weight=0.1``, their options by
-        ``surface.losses.normal_consistency.options.where=object``; entry actions by their name,
-        ``refine.on_enter.clone_in_place.options.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
-        Values are JSON; other text is a string.
+    ``overrides``: ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Dots reach deeper
+    fields: ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
+    ``surface.losses.normal_consistency.weight=0.1``, their options by
+    ``surface.losses.normal_consistency.options.where=object``; entry actions by their name,
+    ``refine.on_enter.clone_in_place.options.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
+    Values are JSON; other text is a string. Raises RecipeError if a field is unknown, or a value has another type.
 
     Returns
     -------
     Recipe
         Validated.
-
-    Raises
-    ------
-    RecipeError
-        If a field is unknown, or a value has another type.
     """
     data = to_json(recipe)
     for override in overrides:
@@ -151,10 +138,7 @@ def encode(value: Any) -> Any:
 def decode(value: Any, kind: Any, where: str) -> Any:
     """Return a JSON value as an annotated type; ``where`` is its name in errors.
 
-    Raises
-    ------
-    RecipeError
-        If a field is unknown or missing, or a value has another type.
+    Raises RecipeError if a field is unknown or missing, or a value has another type.
     """
     origin = get_origin(kind)
     if origin in (Union, UnionType):

@@ -19,16 +19,8 @@ from gs2d.errors import DataError
 def read_npy(path: str | os.PathLike[str], what: str) -> np.ndarray:
     """Read a ``.npy`` file of booleans, integers or floats.
 
-    Parameters
-    ----------
-    path : path
-    what : str
-        Description of the file, for messages.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, damaged, or holds anything but numbers.
+    ``what``: description of the file, for messages. Raises DataError if the file is missing, damaged, or holds anything
+    but numbers.
     """
     name = f"{what} {os.fspath(path)}"
     with _one_line(name, "npy"), open(path, "rb") as file:
@@ -38,10 +30,7 @@ def read_npy(path: str | os.PathLike[str], what: str) -> np.ndarray:
 def read_npz(path: str | os.PathLike[str], what: str, wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
     """Read the arrays of a ``.npz`` archive whose names satisfy ``wanted``.
 
-    Raises
-    ------
-    DataError
-        If the file is missing, damaged, or implausibly large when unpacked.
+    Raises DataError if the file is missing, damaged, or implausibly large when unpacked.
     """
     name = f"{what} {os.fspath(path)}"
     with _one_line(name, "npz"), zipfile.ZipFile(path) as archive:

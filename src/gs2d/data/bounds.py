@@ -21,15 +21,8 @@ def scene_bounds(
     """Return the box that the cameras look at.
 
     With sparse points: their 1st to 99th percentile on each axis, enlarged by a tenth. Without: the region that most
-    cameras see. For synthetic captures: [-1.3, 1.3]^3 if the cameras agree with it.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The training cameras.
-    points : PointCloud or None
-    is_synthetic : bool
-        Whether to try the box of NeRF-Synthetic first.
+    cameras see. For synthetic captures: [-1.3, 1.3]^3 if the cameras agree with it. ``is_synthetic``: whether to
+    try the box of NeRF-Synthetic first.
 
     Returns
     -------

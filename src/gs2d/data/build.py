@@ -184,10 +184,7 @@ def skipping(name: str, skipped: list[str]) -> Iterator[None]:
 def fit_to_file(frame: PosedImage) -> PosedImage:
     """Return the frame with intrinsics for the actual size of its file.
 
-    Raises
-    ------
-    DataError
-        If the file is not an image, or its aspect ratio or that of a mask differs.
+    Raises DataError if the file is not an image, or its aspect ratio or that of a mask differs.
     """
     k = frame.intrinsics
     width, height = image_size(frame.path)
@@ -234,10 +231,7 @@ def build_scene(
 ) -> Scene:
     """Convert a Capture to a Scene: check sizes, downscale cameras, split views, measure extent and bounds.
 
-    Raises
-    ------
-    DataError
-        If there is no training view, a name occurs twice, or all cameras have the same centre.
+    Raises DataError if there is no training view, a name occurs twice, or all cameras have the same centre.
     """
     if not capture.frames:
         raise DataError(f"{root} must contain at least one image with a camera, got none{_explained(capture)}")
@@ -299,10 +293,7 @@ def _explained(capture: Capture) -> str:
 def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tuple[str, ...]]:
     """Return the extent, world units, and a warning if float32 positions are coarse this far from the origin.
 
-    Raises
-    ------
-    DataError
-        If all cameras have the same centre, or float32 positions are too coarse for the scene.
+    Raises DataError if all cameras have the same centre, or float32 positions are too coarse for the scene.
     """
     farthest = max(float(np.abs(camera.center).max()) for camera in cameras)
     if not farthest <= _FARTHEST:

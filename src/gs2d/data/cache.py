@@ -151,12 +151,8 @@ class ImageCache:
 class ReadAhead:
     """Decodes images in advance, on its own threads, to fill a cache.
 
-    Errors are ignored here; they are raised again when the image is requested.
-
-    Parameters
-    ----------
-    load : callable
-        Requests the image of an index.
+    Errors are ignored here; they are raised again when the image is requested. ``load``: requests the image of an
+    index.
     """
 
     def __init__(self, load: Callable[[int], object]) -> None:

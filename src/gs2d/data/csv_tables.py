@@ -17,19 +17,10 @@ _LARGEST = 64 << 20  # bytes
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of a file.
-
-    Attributes
-    ----------
-    path : Path
-    epsg : int or None
-        Coordinate system that the file names.
-    rows : tuple of (line number, text by column)
-    columns : tuple of str
-    """
+    """Rows of a file."""
 
     path: Path
-    epsg: int | None
+    epsg: int | None  # coordinate system that the file names
     rows: tuple[tuple[int, Mapping[str, str]], ...]
     columns: tuple[str, ...]
 
@@ -52,12 +43,8 @@ class Table:
 def read_table(path: Path, plain: Sequence[str], required: Sequence[str]) -> Table:
     """Read a CSV file with a header, or OpenDroneMap's rows below the name of a coordinate system.
 
-    Parameters
-    ----------
-    plain : sequence of str
-        Columns of OpenDroneMap's layout, in order; further columns are ignored.
-    required : sequence of str
-        Columns that a CSV file must have.
+    ``plain``: columns of OpenDroneMap's layout, in order; further columns are ignored. ``required``: columns that a CSV
+    file must have.
     """
     lines = _lines(path)
     first = next((line for line in lines if line[1] and not line[1].startswith("#")), None)
@@ -76,10 +63,7 @@ def read_table(path: Path, plain: Sequence[str], required: Sequence[str]) -> Tab
 def _named_crs(text: str) -> int | None:
     """Return the EPSG code in a line such as ``EPSG:32632``, ``WGS84 UTM 32N`` or ``+proj=utm +zone=32``, or None.
 
-    Raises
-    ------
-    DataError
-        For any other PROJ string.
+    Raises DataError for any other PROJ string.
     """
     text = text.strip()
     if match := re.fullmatch(r"EPSG:\s*(\d{4,6})", text, re.IGNORECASE):

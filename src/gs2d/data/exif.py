@@ -29,27 +29,14 @@ _ORIENTATIONS = range(1, 9)
 
 @dataclass(frozen=True)
 class Taken:
-    """How a photograph was taken.
+    """How a photograph was taken."""
 
-    Attributes
-    ----------
-    orientation : int
-        EXIF, 1 (upright) to 8.
-    made_by : tuple of str
-        Make, model, lens and focal lengths as in EXIF; empty strings if missing.
-    place : (float, float, float) or None
-        Latitude and longitude (degrees, WGS 84) and height (m); a missing height is NaN.
-    seconds : float or None
-        Time of the camera clock, without time zone.
-    panorama : str
-        "whole" or "part" of an equirectangular 360-degree panorama (XMP GPano), or empty.
-    """
-
-    orientation: int = _UPRIGHT
-    made_by: tuple[str, ...] = ("",) * 5
+    orientation: int = _UPRIGHT  # EXIF, 1 (upright) to 8
+    made_by: tuple[str, ...] = ("",) * 5  # make, model, lens and focal lengths as in EXIF; empty strings if missing
+    # Latitude and longitude (degrees, WGS 84) and height (m); a missing height is NaN.
     place: tuple[float, float, float] | None = None
-    seconds: float | None = None
-    panorama: str = ""
+    seconds: float | None = None  # time of the camera clock, without time zone
+    panorama: str = ""  # "whole" or "part" of an equirectangular 360-degree panorama (XMP GPano), or empty
 
 
 def read_taken(path: Path) -> Taken:

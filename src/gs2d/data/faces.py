@@ -56,10 +56,7 @@ class Face:
 def panorama(width: int, height: int, where: str) -> Intrinsics:
     """Return the intrinsics of an equirectangular panorama.
 
-    Raises
-    ------
-    DataError
-        If it is not twice as wide as high.
+    Raises DataError if it is not twice as wide as high.
     """
     if not is_twice_as_wide(width, height):
         raise DataError(

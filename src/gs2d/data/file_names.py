@@ -17,24 +17,12 @@ _SMALLER = re.compile(r"images_\d+")  # downscaled copies
 
 @dataclass(frozen=True)
 class Match:
-    """The file that matches a name.
+    """The file that matches a name."""
 
-    Attributes
-    ----------
-    path : Path or None
-        None if no file or several files match.
-    rank : tuple of int
-        Quality of the match; larger for a longer common end.
-    elsewhere : bool
-        Whether the folders of file and name differ.
-    several : tuple of Path
-        Files that match equally well, if more than one.
-    """
-
-    path: Path | None = None
-    rank: tuple[int, ...] = ()
-    elsewhere: bool = False
-    several: tuple[Path, ...] = ()
+    path: Path | None = None  # None if no file or several files match
+    rank: tuple[int, ...] = ()  # quality of the match; larger for a longer common end
+    elsewhere: bool = False  # whether the folders of file and name differ
+    several: tuple[Path, ...] = ()  # files that match equally well, if more than one
 
 
 class Files:
@@ -44,13 +32,8 @@ class Files:
     below a folder with the longest common end of the path is used. ``\\`` and ``/`` are both separators. Letter case
     and Unicode form (NFC, NFD) matter only if several files differ in nothing else.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-        Folders to search, most likely first, with sub-folders except hidden and linked ones. Missing folders are
-        ignored.
-    base : Path, optional
-        Base folder of relative paths; tried before ``folders``.
+    ``folders``: folders to search, most likely first, with sub-folders except hidden and linked ones. Missing folders
+    are ignored. ``base``: base folder of relative paths; tried before ``folders``.
     """
 
     def __init__(self, folders: Sequence[Path], base: Path | None = None) -> None:
@@ -73,16 +56,9 @@ class Files:
         For the same reason, a file in a contradicting folder (``left/1.png`` for ``right/1.png``) is used only if no
         name has a file in its own folder.
 
-        Parameters
-        ----------
-        names : sequence of sequences of str
-            Spellings of each name, most likely first.
-        not_in : collection of str
-            Folder names, in lower case, whose files match only by their exact path.
-        taken : collection of Path
-            Files that match only by their exact path.
-        moved : bool, optional
-            Whether files in contradicting folders may match at all.
+        ``names``: spellings of each name, most likely first. ``not_in``: folder names, in lower case, whose files match
+        only by their exact path. ``taken``: files that match only by their exact path. ``moved``: whether files in
+        contradicting folders may match at all.
         """
         found = [self._exact(spellings) for spellings in names]
         owned = {match.path for match in found if match.path is not None} | set(taken)

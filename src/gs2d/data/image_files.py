@@ -74,10 +74,7 @@ def _check_pixels(path: str | os.PathLike[str], file: Image.Image, bytes_per_pix
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Return (width, height) of an image file, px, from its header. EXIF orientation is not applied.
 
-    Raises
-    ------
-    DataError
-        If the file is missing or not an image.
+    Raises DataError if the file is missing or not an image.
     """
     with _opened(path, "{path} must be an image, got: {error}") as file:
         return file.size
@@ -90,16 +87,9 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode an image.
 
     EXIF orientation is **not** applied, as in COLMAP: poses refer to the stored pixels. Grey and palette images become
-    RGB, 16-bit grey becomes 8-bit.
-
-    Returns
-    -------
-    ndarray uint8 [H, W, 3], or [H, W, 4] with straight alpha if the file has transparency
-
-    Raises
-    ------
-    DataError
-        If the file is missing, truncated, not an image of ``FORMATS``, or has implausibly many pixels.
+    RGB, 16-bit grey becomes 8-bit. The result is uint8 [H, W, 3], or [H, W, 4] with straight alpha if the file has
+    transparency. Raises DataError if the file is missing, truncated, not an image of ``FORMATS``, or has implausibly
+    many pixels.
     """
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
@@ -116,10 +106,7 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
     """Decode an image without conversion: its array, [h, w] if grey, and its Pillow mode.
 
-    Raises
-    ------
-    DataError
-        As for :func:`read_image`.
+    Raises DataError as for :func:`read_image`.
     """
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
@@ -156,19 +143,9 @@ def _first_line(error: BaseException) -> str:
 def write_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
     """Write a PNG atomically.
 
-    Parameters
-    ----------
-    path : path
-        Its folder must exist.
-    image : ndarray [H, W], [H, W, 3] or [H, W, 4]
-        uint8, bool (white = True), or float in [0, 1] (clipped, rounded to the nearest of 256 levels).
-
-    Raises
-    ------
-    ShapeError
-        If the shape is wrong or a float image has NaN.
-    DiskError
-        If the file could not be written.
+    ``path``: its folder must exist. ``image`` [H, W], [H, W, 3] or [H, W, 4]: uint8, bool (white = True), or float in
+    [0, 1] (clipped, rounded to the nearest of 256 levels). Raises ShapeError if the shape is wrong or a float image has
+    NaN. Raises DiskError if the file could not be written.
     """
     pixels = to_uint8(image)
     if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):

@@ -88,10 +88,7 @@ def _folder(path: str | os.PathLike[str]) -> Path:
 def reader_of(format: str) -> Reader:
     """Return the reader of a format.
 
-    Raises
-    ------
-    DataError
-        If there is no such reader, or its package cannot be imported.
+    Raises DataError if there is no such reader, or its package cannot be imported.
     """
     if format not in READERS:
         raise DataError(READERS.unknown(format, also=("auto",)))

@@ -26,21 +26,12 @@ _NAMED, _BESIDE = "the camera file", "the image folder"
 
 @dataclass(frozen=True)
 class Masks:
-    """Masks of a capture.
+    """Masks of a capture."""
 
-    Attributes
-    ----------
-    folder : Path or None
-        Folder set by the user; None: the usual folders.
-    masked : "ignore", "empty", "off" or None
-        Meaning of a black pixel; None: ignored if the protocol uses masks.
-    found : int
-        Number of views with a mask.
-    """
-
-    folder: Path | None = None
+    folder: Path | None = None  # folder set by the user; None: the usual folders
+    # "ignore", "empty", "off" or None; meaning of a black pixel; None: ignored if the protocol uses masks
     masked: str | None = None
-    found: int = 0
+    found: int = 0  # number of views with a mask
 
     def __post_init__(self) -> None:
         if self.masked not in (None, *MASKED):
@@ -96,22 +87,9 @@ def find_masks(
 ) -> tuple[list[Path | None], str]:
     """Return the mask of each image, and a note ("" without masks).
 
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the images, with ``/``.
-    images : sequence of Path
-        Image files.
-    named : sequence of Path or None
-        Masks named by the capture, which take precedence.
-    homes : sequence of Path
-        Folders that may hold a folder ``masks``.
-    masks : Masks
-
-    Raises
-    ------
-    DataError
-        If the folder set by the user has no mask of any image.
+    ``names``: names of the images, with ``/``. ``images``: image files. ``named``: masks named by the capture, which
+    take precedence. ``homes``: folders that may hold a folder ``masks``. Raises DataError if the folder set by the user
+    has no mask of any image.
     """
     if masks.masked == OFF:
         return [None] * len(names), "masks are not used (--masked off)" if any(named) else ""

@@ -18,24 +18,14 @@ _E2 = _FLATTENING * (2 - _FLATTENING)
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Camera positions by image name.
+    """Camera positions by image name."""
 
-    Attributes
-    ----------
-    places : mapping of str to ndarray [3]
-        Latitude, longitude (degrees, WGS 84), height (m); or east, north, height in metres. An unknown height is NaN.
-    epsg : int or None
-        Coordinate system, if it is projected and named in the file.
-    source : str
-        Description for messages.
-    in_degrees : bool
-        Whether positions are latitudes and longitudes.
-    """
-
+    # [3] by name: latitude, longitude (degrees, WGS 84), height (m); or east, north, height in metres. Unknown heights
+    # are NaN.
     places: Mapping[str, np.ndarray]
-    epsg: int | None
-    source: str
-    in_degrees: bool
+    epsg: int | None  # coordinate system, if it is projected and named in the file
+    source: str  # description for messages
+    in_degrees: bool  # whether positions are latitudes and longitudes
 
 
 def read_positions(path: Path) -> Positions:
@@ -65,12 +55,8 @@ def read_positions(path: Path) -> Positions:
 def matched(positions: Positions, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Return the position of each image that has one.
 
-    Names are compared whole, then without suffix, then without folders, then as bare stems.
-
-    Raises
-    ------
-    DataError
-        If a listed name fits several images.
+    Names are compared whole, then without suffix, then without folders, then as bare stems. Raises DataError if a
+    listed name fits several images.
     """
     found: dict[str, np.ndarray] = {}
     for key in (

@@ -35,18 +35,10 @@ _ASPECT = 0.02  # relative tolerance: networks write sides that are multiples of
 
 @dataclass(frozen=True, eq=False)
 class PriorDepth:
-    """Depths along the optical axis at the pixels of a view.
+    """Depths along the optical axis at the pixels of a view."""
 
-    Attributes
-    ----------
-    values : ndarray [H, W] float32
-        In the unit of the file; 0 = unknown.
-    whole : bool
-        Whether the file holds integers (mostly millimetres).
-    """
-
-    values: np.ndarray
-    whole: bool
+    values: np.ndarray  # [H, W] float32; in the unit of the file; 0 = unknown
+    whole: bool  # whether the file holds integers (mostly millimetres)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,38 +51,21 @@ class PointsInView:
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoints:
-    """Sparse points of a reconstruction and the views that observe them.
+    """Sparse points of a reconstruction and the views that observe them."""
 
-    Attributes
-    ----------
-    points : ndarray [P, 3] float64 world units
-    error : ndarray [P] float64 px
-        Mean reprojection error.
-    track : ndarray [P] int64
-        Number of views that observe the point.
-    seen : mapping of view name to ndarray [M] int32 or int64
-        Indices of the observed points.
-    guessed : str
-        Why the capture has no observations; ``seen`` then comes from projecting the points. Empty otherwise.
-    """
-
-    points: np.ndarray
-    error: np.ndarray
-    track: np.ndarray
-    seen: Mapping[str, np.ndarray]
+    points: np.ndarray  # [P, 3] float64 world units
+    error: np.ndarray  # [P] float64 px; mean reprojection error
+    track: np.ndarray  # [P] int64; number of views that observe the point
+    seen: Mapping[str, np.ndarray]  # view name to ndarray [M] int32 or int64; indices of the observed points
+    # Why the capture has no observations; ``seen`` then comes from projecting the points. Empty otherwise.
     guessed: str = ""
 
     @classmethod
     def projected(cls, points: np.ndarray | None, cameras: Mapping[str, Camera], why: str) -> ObservedPoints:
         """Guess the observations of points by projection and an occlusion test.
 
-        Parameters
-        ----------
-        points : ndarray [P, 3] world units, or None
-            At most ``MAX_PROJECTED``, evenly chosen, are assigned to views.
-        cameras : mapping of view name to Camera
-        why : str
-            Reason for ``guessed``.
+        ``points`` [P, 3] world units: at most ``MAX_PROJECTED``, evenly chosen, are assigned to views. ``why``: reason
+        for ``guessed``.
         """
         points = np.zeros((0, 3)) if points is None else np.asarray(points, dtype=np.float64)
         some = np.arange(0, len(points), max(1, -(-len(points) // MAX_PROJECTED)), dtype=np.int32)
@@ -101,16 +76,8 @@ class ObservedPoints:
     def in_view(self, name: str, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
         """Return the points that a view observes, in front of it and inside its outer pixel centres.
 
-        Parameters
-        ----------
-        name : str
-            Name of the view.
-        camera : Camera
-            Camera of the view, at training size.
-        min_track : int
-            Smallest number of views per point.
-        max_error : float, px
-            Largest mean reprojection error.
+        ``camera`` has the training size. ``min_track`` is the least number of views per point, ``max_error`` (px) the
+        largest mean reprojection error.
         """
         rows = self.seen.get(name, np.zeros(0, dtype=np.int64))
         return self._project(rows, camera, min_track, max_error)
@@ -141,47 +108,26 @@ def _unhidden(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MapFiles:
-    """Map files of an image.
-
-    Attributes
-    ----------
-    depth, normal : Path or None
-    unit : float or None
-        World units per unit of depth, if the capture states it.
-    metric : bool
-        Whether the depths come from a sensor.
-    """
+    """Map files of an image."""
 
     depth: Path | None = None
     normal: Path | None = None
-    unit: float | None = None
-    metric: bool = False
+    unit: float | None = None  # world units per unit of depth, if the capture states it
+    metric: bool = False  # whether the depths come from a sensor
 
 
 @dataclass(frozen=True, eq=False)
 class PriorMaps:
-    """Maps of a view, decoded on demand.
-
-    Attributes
-    ----------
-    files : MapFiles
-    intrinsics : Intrinsics
-        Intrinsics of the image file, with its lens.
-    camera : Camera
-        Pinhole camera of the view, at training size.
-    """
+    """Maps of a view, decoded on demand."""
 
     files: MapFiles
-    intrinsics: Intrinsics
-    camera: Camera
+    intrinsics: Intrinsics  # intrinsics of the image file, with its lens
+    camera: Camera  # pinhole camera of the view, at training size
 
     def depth(self) -> PriorDepth:
         """Return the depth map at the pixels of the view.
 
-        Raises
-        ------
-        DataError
-            If the file is not a depth map, or its aspect ratio differs from the image.
+        Raises DataError if the file is not a depth map, or its aspect ratio differs from the image.
         """
         assert self.files.depth is not None
         values = read_depth(self.files.depth)
@@ -195,10 +141,7 @@ class PriorMaps:
     def normal(self) -> np.ndarray:
         """Return unit normals [H, W, 3] float32 in the axes of the file; 0 = unknown.
 
-        Raises
-        ------
-        DataError
-            If the file is not a normal map, or its aspect ratio differs from the image.
+        Raises DataError if the file is not a normal map, or its aspect ratio differs from the image.
         """
         assert self.files.normal is not None
         normals = read_normals(self.files.normal)
@@ -234,12 +177,8 @@ def find_maps(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> li
 def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
     """Read a depth map [h, w]: a grey image of 8, 16 or 32 bits, or a NumPy array.
 
-    An image with three equal channels counts as grey.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, not a depth map, or has no value above 0.
+    An image with three equal channels counts as grey. Raises DataError if the file is missing, not a depth map, or has
+    no value above 0.
     """
     path = Path(path)
     if path.suffix == ".npy":
@@ -267,12 +206,8 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
 def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
     """Read unit normals [h, w, 3] float32 from an RGB image of (n + 1) / 2 or an array of n; 0 = unknown.
 
-    Black and transparent pixels and vectors of a length outside ``UNIT_LENGTH`` are unknown.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, not a normal map, or has no valid normal.
+    Black and transparent pixels and vectors of a length outside ``UNIT_LENGTH`` are unknown. Raises DataError if the
+    file is missing, not a normal map, or has no valid normal.
     """
     path = Path(path)
     if path.suffix == ".npy":

@@ -13,17 +13,10 @@ NEARLY_ALL = 98.0  # percentile of distances; farther points are outliers or far
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """A ball that contains the cameras and nearly all sparse points.
+    """A ball that contains the cameras and nearly all sparse points."""
 
-    Attributes
-    ----------
-    center : ndarray [3] world units
-        Mean of the training cameras.
-    radius : float, world units
-    """
-
-    center: np.ndarray
-    radius: float
+    center: np.ndarray  # [3] world units; mean of the training cameras
+    radius: float  # world units
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Return which points [P, 3] are inside, [P] bool."""
@@ -33,11 +26,7 @@ class Reach:
 def reach_of(scene: Scene, further: np.ndarray | None = None) -> Reach | None:
     """Return the reach of a scene; None without points.
 
-    Parameters
-    ----------
-    scene : Scene
-    further : ndarray [P, 3] world units, optional
-        Points beside the sparse points.
+    ``further`` [P, 3] world units: points beside the sparse points.
     """
     center = np.stack([view.camera.center for view in scene.train]).mean(axis=0)
     known = [array for array in (None if scene.points is None else scene.points.points, further) if array is not None]

@@ -36,20 +36,11 @@ _SEEDS = 16  # start positions of the mean shift
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """The surface that one camera sees.
-
-    Attributes
-    ----------
-    camera : Camera
-    points : ndarray [P, 3] world units
-        Surface points.
-    weights : ndarray [P]
-        Parts of the vote of the camera; their sum is 1, or 0 without surface.
-    """
+    """The surface that one camera sees."""
 
     camera: Camera
-    points: np.ndarray
-    weights: np.ndarray
+    points: np.ndarray  # [P, 3] world units; surface points
+    weights: np.ndarray  # [P]; parts of the vote of the camera; their sum is 1, or 0 without surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,10 +113,7 @@ class Subject:
 def read_subject(run: Path) -> Subject | None:
     """Read the subject of a run folder; None without one.
 
-    Raises
-    ------
-    DataError
-        If ``subject.json`` is damaged.
+    Raises DataError if ``subject.json`` is damaged.
     """
     path = Path(run) / SUBJECT
     if not path.exists():
@@ -142,10 +130,7 @@ def read_subject(run: Path) -> Subject | None:
 def checked_box(box: Sequence[float], option: str) -> np.ndarray:
     """Return both corners [2, 3], world units, of a box x0 y0 z0 x1 y1 z1 from the command line.
 
-    Raises
-    ------
-    DataError
-        If the numbers are not a box.
+    Raises DataError if the numbers are not a box.
     """
     corners = np.asarray(box, np.float64)
     if corners.shape != (6,) or not (np.abs(corners) <= LARGEST).all() or not (corners[:3] < corners[3:]).all():
@@ -157,18 +142,8 @@ def checked_box(box: Sequence[float], option: str) -> np.ndarray:
 def check_subject_box(box: Sequence[float] | None, others: Mapping[str, bool]) -> None:
     """Check ``--subject-box``: a valid box, and no conflicting option.
 
-    Parameters
-    ----------
-    box : sequence of 6 floats, optional
-    others : mapping of str to bool
-        Conflicting options, and whether they are set.
-
-    Raises
-    ------
-    DataError
-        If the numbers are not a box.
-    ProtocolError
-        If a conflicting option is set.
+    ``others``: conflicting options, and whether they are set. Raises DataError if the numbers are not a box. Raises
+    ProtocolError if a conflicting option is set.
     """
     if box is None:
         return
@@ -181,10 +156,7 @@ def check_subject_box(box: Sequence[float] | None, others: Mapping[str, bool]) -
 def given_subject(box: Sequence[float], cameras: Sequence[Camera]) -> Subject:
     """Return the object in a box x0 y0 z0 x1 y1 z1, world units.
 
-    Raises
-    ------
-    DataError
-        If the numbers are not a box.
+    Raises DataError if the numbers are not a box.
     """
     low, high = checked_box(box, "--subject-box")
     return Subject(OBJECT, low, high, (low + high) / 2, up_direction(cameras), "set with --subject-box")
@@ -205,15 +177,7 @@ def shown(camera: Camera, points: np.ndarray) -> np.ndarray:
 def find_subject(sights: Sequence[Sight]) -> Subject:
     """Find what most cameras look at.
 
-    Parameters
-    ----------
-    sights : sequence of Sight
-        One per camera.
-
-    Raises
-    ------
-    DataError
-        If no camera sees any surface.
+    ``sights``: one per camera. Raises DataError if no camera sees any surface.
     """
     cameras = [sight.camera for sight in sights]
     voters = [sight for sight in sights if sight.weights.sum() > 0]

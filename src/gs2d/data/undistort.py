@@ -71,21 +71,9 @@ class Intrinsics:
 def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: tuple[float, ...]) -> Intrinsics:
     """Return the intrinsics of a COLMAP camera.
 
-    Parameters
-    ----------
-    camera : str
-        Name of the camera in errors.
-    model : str
-        Name of the camera model in COLMAP.
-    params : tuple of float
-        In the order of COLMAP.
-
-    Raises
-    ------
-    UnusableViewError
-        If a parameter is not finite.
-    DataError
-        If the model is not supported, or the parameters are invalid.
+    ``camera``: name of the camera in errors. ``model``: name of the camera model in COLMAP. ``params``: in the order of
+    COLMAP. Raises UnusableViewError if a parameter is not finite. Raises DataError if the model is not supported, or
+    the parameters are invalid.
     """
     expected, kind, names = COLMAP_MODELS.get(model, (0, "", ""))
     if not kind:
@@ -146,11 +134,7 @@ def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
 def undistort_image(image: np.ndarray, positions: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Sample an image bilinearly at ``positions`` (from ``source_positions``); 0 where invalid.
 
-    Colour is interpolated premultiplied by alpha and stored straight.
-
-    Parameters
-    ----------
-    image : ndarray uint8 [H, W, 3 or 4]
+    Colour is interpolated premultiplied by alpha and stored straight. ``image`` is uint8 [H, W, 3 or 4].
     """
     planes = torch.from_numpy(np.array(image)).permute(2, 0, 1).to(torch.float32)  # [C, H, W]
     has_alpha = len(planes) == 4

@@ -21,10 +21,7 @@ class EventLog:
     def append(self, event: dict[str, Any]) -> None:
         """Write one event.
 
-        Raises
-        ------
-        DiskError
-            If it could not be written; the log then ends with its last complete line.
+        Raises DiskError if it could not be written; the log then ends with its last complete line.
         """
         line = (json.dumps(event, allow_nan=False, sort_keys=True) + "\n").encode()
         self.append_text(line)
@@ -76,10 +73,7 @@ class EventLog:
     def read(self) -> list[dict[str, Any]]:
         """Return all complete events.
 
-        Raises
-        ------
-        RunError
-            If a line is no JSON object.
+        Raises RunError if a line is no JSON object.
         """
         if not self.path.exists():
             return []

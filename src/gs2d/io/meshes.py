@@ -107,15 +107,12 @@ def _write_ply(path: Path, mesh: Mesh) -> None:
 def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     """Read a mesh from PLY, OBJ, STL or OFF. Polygons become triangles; other properties are ignored.
 
+    Raises DataError if the file is broken, has vertices but no faces, or a face refers to a missing vertex.
+
     Returns
     -------
     Mesh
         Vertices are float32, or float64 if the file has doubles or is no PLY.
-
-    Raises
-    ------
-    DataError
-        If the file is broken, has vertices but no faces, or a face refers to a missing vertex.
     """
     if Path(path).suffix.lower() in FOREIGN:
         return _read_foreign(Path(path))
@@ -202,10 +199,7 @@ def _colors(vertex: PlyElement) -> np.ndarray | None:
 def read_points(path: str | os.PathLike[str]) -> Points:
     """Read the vertices of any PLY file as a point cloud.
 
-    Raises
-    ------
-    DataError
-        If the file is broken or has no vertex positions.
+    Raises DataError if the file is broken or has no vertex positions.
     """
     vertex = read_ply(path).elements.get("vertex")
     positions = vertex.scalars("x", "y", "z") if vertex else None
@@ -217,10 +211,7 @@ def read_points(path: str | os.PathLike[str]) -> Points:
 def written_files(path: Path) -> tuple[Path, ...]:
     """Return the files that ``write_mesh`` creates for a textured mesh.
 
-    Raises
-    ------
-    DataError
-        If the suffix is neither .glb nor .obj, or an OBJ file cannot refer to the name.
+    Raises DataError if the suffix is neither .glb nor .obj, or an OBJ file cannot refer to the name.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -327,10 +318,7 @@ def write_pieces(path: Path, pieces: Sequence[Mesh]) -> None:
 def read_textured(path: str | Path) -> TexturedMesh:
     """Read a textured mesh from a .glb file of ``write_mesh``.
 
-    Raises
-    ------
-    DataError
-        If the file is damaged or was written by another program.
+    Raises DataError if the file is damaged or was written by another program.
     """
     try:
         data = Path(path).read_bytes()

@@ -59,12 +59,8 @@ class PlyElement:
     def reals(self, path: object, name: str) -> np.ndarray:
         """Return a property [count] of real numbers as float64; 2-byte integers are read as half floats.
 
-        PLY has no type for half floats, so programs that write them declare ``ushort``.
-
-        Raises
-        ------
-        DataError
-            If it has another integer type.
+        PLY has no type for half floats, so programs that write them declare ``ushort``. Raises DataError if it has
+        another integer type.
         """
         values = self.scalar(name)
         if values.dtype.kind in "iu" and values.dtype.itemsize != 2:
@@ -126,10 +122,7 @@ class _Header:
 def read_ply(path: str | os.PathLike[str]) -> PlyFile:
     """Read all elements of a PLY file.
 
-    Raises
-    ------
-    DataError
-        If the file is missing, is no PLY, has a malformed header, or ends early.
+    Raises DataError if the file is missing, is no PLY, has a malformed header, or ends early.
     """
     data = _read(path)
     header = _parse_header(path, data)
@@ -362,18 +355,8 @@ def write_ply(
 ) -> None:
     """Write a binary little-endian PLY file atomically.
 
-    Parameters
-    ----------
-    path : path
-    elements : mapping of element name to structured array [n]
-        A field of shape (k,) becomes a list property of k items with a uchar count (k < 256).
-    comments : tuple of str
-        Comment lines.
-
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
+    ``elements`` (element name to structured array [n]): a field of shape (k,) becomes a list property of k items with a
+    uchar count (k < 256). ``comments``: comment lines. Raises DiskError if the file could not be written.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
     bodies = []

@@ -99,10 +99,7 @@ class RunFolder:
     def definition(self) -> dict[str, Any]:
         """Read ``run.json``.
 
-        Raises
-        ------
-        RunError
-            If another version of gs2d wrote it, or it is damaged.
+        Raises RunError if another version of gs2d wrote it, or it is damaged.
         """
         try:
             data = _object(self.file(RUN_JSON))
@@ -121,10 +118,7 @@ class RunFolder:
     def metrics(self) -> dict[str, Any]:
         """Read ``metrics.json``; ``{"stages": []}`` before the first stage is finished.
 
-        Raises
-        ------
-        RunError
-            If it is damaged.
+        Raises RunError if it is damaged.
         """
         path = self.file(METRICS)
         if not path.exists():
@@ -169,10 +163,7 @@ class RunFolder:
     def locked(self) -> Iterator[None]:
         """Lock the run, and remove incomplete files of killed processes.
 
-        Raises
-        ------
-        RunError
-            If another process trains in this folder.
+        Raises RunError if another process trains in this folder.
         """
         try:
             file = open(self.file(LOCK), "a+b")  # noqa: SIM115 - closed below; the lock lives as long as the file
@@ -233,10 +224,7 @@ def is_run(path: Path) -> bool:
 def open_run(path: str | Path) -> RunFolder:
     """Open an existing run.
 
-    Raises
-    ------
-    RunError
-        If the folder does not exist or holds no run.
+    Raises RunError if the folder does not exist or holds no run.
     """
     path = Path(path)
     if not is_run(path):
@@ -249,10 +237,7 @@ def open_run(path: str | Path) -> RunFolder:
 def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple[str, ...] = ()) -> None:
     """Check early that :func:`claim_run` will succeed; writes nothing.
 
-    Raises
-    ------
-    RunError
-        If ``path`` is a file, holds a run (without ``resume`` or ``overwrite``), or holds other files.
+    Raises RunError if ``path`` is a file, holds a run (without ``resume`` or ``overwrite``), or holds other files.
     """
     path = Path(path)
     if resume and overwrite:
@@ -280,13 +265,8 @@ def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tup
 def claim_run(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple[str, ...] = ()) -> RunFolder:
     """Create a run folder, or take over an existing run.
 
-    Parameters
-    ----------
-    path : path
-    resume, overwrite : bool
-        Continue or replace an existing run; ``overwrite`` deletes the files of the run only.
-    allowed : tuple of str
-        Names of files that may exist in a folder without a run.
+    ``resume`` and ``overwrite``: continue or replace an existing run; ``overwrite`` deletes the files of the run only.
+    ``allowed``: names of files that may exist in a folder without a run.
     """
     check_claim(path, resume=resume, overwrite=overwrite, allowed=allowed)
     path = Path(path)
@@ -326,12 +306,8 @@ def save_tensors(path: Path, payload: dict[str, Any]) -> None:
 def load_tensors(path: Path) -> dict[str, Any]:
     """Read a file of :func:`save_tensors`: tensors and plain values only, no code is executed.
 
-    torch does not verify the checksums in its files, so they are verified here.
-
-    Raises
-    ------
-    RunError
-        If the file is missing or damaged.
+    torch does not verify the checksums in its files, so they are verified here. Raises RunError if the file is missing
+    or damaged.
     """
     import pickle
 

@@ -94,10 +94,7 @@ def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Spl
 def read_gaussians(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
     """Read 3DGS splats, with three scales; otherwise as ``read_splats``.
 
-    Raises
-    ------
-    DataError
-        If the file is broken, no PLY, or has fewer scales.
+    Raises DataError if the file is broken, no PLY, or has fewer scales.
     """
     vertex = read_ply(path).elements.get("vertex")
     if vertex is None:
@@ -150,10 +147,7 @@ def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...], tell:
 def ply_kind(path: str | os.PathLike[str]) -> str:
     """Return the content of a PLY file: "2dgs", "3dgs" or "compressed" splats, a "mesh" (with faces), or "points".
 
-    Raises
-    ------
-    DataError
-        If the file is no PLY or is broken.
+    Raises DataError if the file is no PLY or is broken.
     """
     file = read_ply(path)
     vertex = file.elements.get("vertex")

@@ -31,12 +31,8 @@ _TAGS = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt7
 def check_video(path: Path, fps: float, frames: int) -> None:
     """Check early that a video can be written.
 
-    Raises
-    ------
-    DataError
-        For another suffix, an invalid frame rate, or too few frames.
-    BackendError
-        For ``.mp4`` without an ffmpeg that supports H.264.
+    Raises DataError for another suffix, an invalid frame rate, or too few frames. Raises BackendError for ``.mp4``
+    without an ffmpeg that supports H.264.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -67,19 +63,10 @@ def write_video(
 ) -> None:
     """Encode images as a video.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in ``.mp4`` or ``.webp``; its folder must exist.
-    frames : sequence of Path
-        At least 2 images of equal size. For ``.mp4`` they are decoded one at a time, and odd sides lose their last row
-        or column. For ``.webp`` all are in memory.
-    fps : float
-        Frames per second.
-    threads : int
-        Threads of ffmpeg.
-    on_frame : callable
-        Called with the number of finished frames. An exception it raises stops the encoding without leaving a file.
+    ``path``: ends in ``.mp4`` or ``.webp``; its folder must exist. ``frames``: at least 2 images of equal size. For
+    ``.mp4`` they are decoded one at a time, and odd sides lose their last row or column. For ``.webp`` all are in
+    memory. ``on_frame``: called with the number of finished frames. An exception it raises stops the encoding without
+    leaving a file.
     """
     check_video(path, fps, len(frames))
     if path.suffix.lower() == ".mp4":
@@ -131,10 +118,7 @@ def _run(words: list[str], images: Iterator[Image.Image], path: Path) -> None:
 def _decoded(frames: Sequence[Path], on_frame: Callable[[int], None]) -> Iterator[Image.Image]:
     """Yield the frames as RGB images.
 
-    Raises
-    ------
-    DataError
-        If their sizes differ.
+    Raises DataError if their sizes differ.
     """
     size = None
     for done, path in enumerate(frames, 1):

@@ -43,70 +43,38 @@ _PHASES = {
 
 @dataclass(frozen=True)
 class Group:
-    """Images of one camera.
-
-    Attributes
-    ----------
-    names : tuple of str
-    camera_model : str
-        COLMAP camera model.
-    size : (int, int)
-        Width and height, px.
-    original : str
-        An image file with EXIF.
-    """
+    """Images of one camera."""
 
     names: tuple[str, ...]
-    camera_model: str
-    size: tuple[int, int]
-    original: str
+    camera_model: str  # COLMAP camera model
+    size: tuple[int, int]  # width and height, px
+    original: str  # an image file with EXIF
 
 
 @dataclass(frozen=True)
 class Request:
-    """Input of the worker. Every path is absolute.
+    """Input of the worker. Every path is absolute."""
 
-    Attributes
-    ----------
-    images : str
-        Folder of the images.
-    database, output : str
-        COLMAP database, and the folder for the models ``0``, ``1`` ...
-    groups : tuple of Group
-    in_order : tuple of str
-        All image names, in the order in which they were taken.
-    ordered_by : "time" or "name"
-        Source of that order.
-    places : tuple of (x, y, z) or None
-        Position of each name in ``in_order``, metres; None if unknown.
-    matching : "exhaustive", "sequential", "similar" or "spatial"
-    overlap, neighbours : int
-        Number of consecutive and of similar images that each image is matched with, unless all pairs are matched.
-    mapper : "incremental" or "global"
-    feature_size : int
-        Longer side for feature detection, px.
-    asked_lens : str or None
-        Requested camera model; None: by the number of images (``lens``).
-    masks : str or None
-        Folder of masks (``NAME.png``): black pixels give no features.
-    """
-
-    images: str
+    images: str  # folder of the images
+    # database, output: COLMAP database, and the folder for the models ``0``, ``1`` ...
     database: str
     output: str
     groups: tuple[Group, ...]
-    in_order: tuple[str, ...]
-    ordered_by: str
+    in_order: tuple[str, ...]  # all image names, in the order in which they were taken
+    ordered_by: str  # "time" or "name"; source of that order
+    # Position of each name in ``in_order``, metres; None if unknown.
     places: tuple[tuple[float, float, float] | None, ...]
-    matching: str
+    matching: str  # "exhaustive", "sequential", "similar" or "spatial"
+    # overlap, neighbours: number of consecutive and of similar images that each image is matched with, unless all pairs
+    # are matched
     overlap: int
     neighbours: int
-    mapper: str
-    feature_size: int
+    mapper: str  # "incremental" or "global"
+    feature_size: int  # longer side for feature detection, px
     threads: int
     seed: int
-    asked_lens: str | None = None
-    masks: str | None = None
+    asked_lens: str | None = None  # requested camera model; None: by the number of images (``lens``)
+    masks: str | None = None  # folder of masks (``NAME.png``): black pixels give no features
 
 
 def layers(request: Request) -> dict[str, Any]:
@@ -129,18 +97,11 @@ def check_installed() -> None:
 
 @dataclass(frozen=True)
 class Solved:
-    """Result of the worker.
+    """Result of the worker."""
 
-    Attributes
-    ----------
-    models : list of dict
-        Facts of each model that was written, largest first; empty if nothing could be placed.
-    lens : dict
-        The lens, ``chosen`` and ``asked``; empty without a model.
-    """
-
+    # Facts of each model that was written, largest first; empty if nothing could be placed.
     models: list[dict[str, Any]]
-    lens: dict[str, Any]
+    lens: dict[str, Any]  # the lens, ``chosen`` and ``asked``; empty without a model
 
 
 def solve(
@@ -148,15 +109,8 @@ def solve(
 ) -> Solved:
     """Estimate the cameras.
 
-    Parameters
-    ----------
-    command : sequence of str
-        Command line of the worker, without the request (default: ``colmap_worker``).
-
-    Raises
-    ------
-    DataError
-        If the worker failed or crashed; with the phase and its last line.
+    ``command``: command line of the worker, without the request (default: ``colmap_worker``). Raises DataError if the
+    worker failed or crashed; with the phase and its last line.
     """
     work = Path(request.database).parent
     with atomic_write(work / "request.json", "w") as file:
@@ -258,12 +212,8 @@ class MatchFacts:
 def read_facts(database: Path) -> MatchFacts:
     """Read the database of a finished worker.
 
-    A pair's number is 2147483647 * (smaller image id) + (larger one) (COLMAP's documentation, Database Format).
-
-    Raises
-    ------
-    DataError
-        If it cannot be read. SQLite needs free disk space to read a database that another process wrote.
+    A pair's number is 2147483647 * (smaller image id) + (larger one) (COLMAP's documentation, Database Format). Raises
+    DataError if it cannot be read. SQLite needs free disk space to read a database that another process wrote.
     """
     try:
         with contextlib.closing(_open(database)) as connection:

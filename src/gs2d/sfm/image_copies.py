@@ -25,14 +25,8 @@ def copy_images(
 ) -> Generator[str, None, None]:
     """Copy images into ``folder``; yields "copied", "linked", "turned", "resized" or "converted" for each.
 
-    Files that exist, from an interrupted search, are kept.
-
-    Parameters
-    ----------
-    max_size : int or None
-        Largest longer side, px.
-    link : bool
-        Use hard links for unchanged images; they are copied if the folder is on another disk.
+    Files that exist, from an interrupted search, are kept. ``max_size``: largest longer side, px. ``link``: use hard
+    links for unchanged images; they are copied if the folder is on another disk.
     """
     for parent in sorted({(folder / photo.name).parent for photo in photos}):
         try:

@@ -24,12 +24,8 @@ ITERATIONS = 30  # of the bundle adjustment: it starts close to the solution
 def with_rich_lenses(pycolmap: Any, piece: Any, *, threads: int) -> Any:
     """Return a model whose cameras with ``ENOUGH`` images have the lens ``RICH``, adjusted to it.
 
-    The model itself is returned if there are none, or if a lens becomes implausible.
-
-    Parameters
-    ----------
-    piece : pycolmap.Reconstruction
-        Placed with ``START``; cameras with other lenses keep them.
+    The model itself is returned if there are none, or if a lens becomes implausible. ``piece``: placed with ``START``;
+    cameras with other lenses keep them.
     """
     images = Counter(image.camera_id for image in piece.images.values() if image.has_pose)
     rich = [n for n, camera in piece.cameras.items() if camera.model.name == START and images[n] >= ENOUGH]

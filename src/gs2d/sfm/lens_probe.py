@@ -24,12 +24,7 @@ _TRIALS = 1000  # of RANSAC
 def fisheye_focal(pycolmap: Any, database: Any, camera: Any, *, seed: int) -> float | None:
     """Return the focal length in px of the equidistant fisheye that fits the matches best; None if too few pairs match.
 
-    Parameters
-    ----------
-    database : pycolmap.Database
-        With matches of pairs, verified with any lens.
-    camera : pycolmap.Camera
-        Its id, size and principal point are used.
+    ``database``: with matches of pairs, verified with any lens. ``camera``: its id, size and principal point are used.
     """
     matches = _matches(pycolmap, database, camera.camera_id, seed)
     if not matches:

@@ -23,13 +23,7 @@ def map_incrementally(
 ) -> list[str]:
     """Place images one by one, starting from a pair; images that do not fit start further models.
 
-    Returns the names of the models.
-
-    Parameters
-    ----------
-    options : pycolmap.IncrementalPipelineOptions
-    on_placed : function of an int
-        Called with the number of images that were just placed.
+    Returns the names of the models. ``on_placed``: called with the number of images that were just placed.
     """
     manager = pycolmap.ReconstructionManager()
     _run(pycolmap, database, options, manager, on_placed)

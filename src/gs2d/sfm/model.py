@@ -31,30 +31,16 @@ _SHOOTING = "take photographs a step apart, with two thirds of overlap"
 
 @dataclass(frozen=True, eq=False)
 class SfmModel:
-    """One model: a connected set of images.
-
-    Attributes
-    ----------
-    images : tuple of ColmapImage
-    cameras : dict of int to ColmapCamera
-    points : ColmapPoints
-    mean_error : float, px
-        Mean reprojection error.
-    mean_track : float
-        Mean number of images per point.
-    median_angle : float, degrees
-        Median over points of the widest angle between two rays. Near 0 for a camera that only rotated.
-    upright : bool
-        Whether +z is up.
-    """
+    """One model: a connected set of images."""
 
     images: tuple[ColmapImage, ...]
     cameras: Mapping[int, ColmapCamera]
     points: ColmapPoints
-    mean_error: float
-    mean_track: float
+    mean_error: float  # px; mean reprojection error
+    mean_track: float  # mean number of images per point
+    # Degrees; median over points of the widest angle between two rays. Near 0 for a camera that only rotated.
     median_angle: float
-    upright: bool
+    upright: bool  # whether +z is up
 
     @property
     def names(self) -> set[str]:

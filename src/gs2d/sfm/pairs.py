@@ -15,18 +15,10 @@ _SAMPLES = 30_000  # descriptors for k-means
 
 @dataclass(frozen=True)
 class Chosen:
-    """Pairs to match, with the reasons.
+    """Pairs to match, with the reasons."""
 
-    Attributes
-    ----------
-    pairs : tuple of (int, int)
-        i < j, ascending.
-    reasons : mapping of str to int
-        Number of pairs for each reason; a pair may have several.
-    """
-
-    pairs: tuple[tuple[int, int], ...]
-    reasons: Mapping[str, int]
+    pairs: tuple[tuple[int, int], ...]  # i < j, ascending
+    reasons: Mapping[str, int]  # number of pairs for each reason; a pair may have several
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -56,12 +48,7 @@ def neighbour_pairs(count: int, overlap: int) -> set[tuple[int, int]]:
 def near_pairs(positions: Sequence[Sequence[float] | None], neighbours: int) -> set[tuple[int, int]]:
     """Return pairs (i < j) of each image with the spatially nearest ones.
 
-    Parameters
-    ----------
-    positions : sequence of [3] or None
-        Metres; None if unknown.
-    neighbours : int
-        Number of nearest images to pair each image with.
+    ``positions`` [3]: metres; None if unknown. ``neighbours``: number of nearest images to pair each image with.
     """
     known = [i for i, position in enumerate(positions) if position is not None]
     if len(known) < 2:
@@ -85,12 +72,8 @@ def similar_pairs(
     normalised per centre and as a whole (VLAD with intra-normalisation: Jegou et al. 2010, Arandjelovic and
     Zisserman 2013). The cluster centres are computed from the images, so nothing is downloaded.
 
-    Parameters
-    ----------
-    read : callable
-        Returns the descriptors [M, 128] of an image; called twice for each.
-    neighbours : int or sequence of int
-        Number of similar images to pair each image with, for all or for each.
+    ``read``: returns the descriptors [M, 128] of an image; called twice for each. ``neighbours``: number of similar
+    images to pair each image with, for all or for each.
     """
     each_of = [neighbours] * count if isinstance(neighbours, int) else neighbours
     rng = np.random.default_rng(seed)

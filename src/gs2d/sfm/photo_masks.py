@@ -24,19 +24,9 @@ _ASPECT = 0.01  # largest relative difference of the aspect ratios of a mask and
 def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[list[Path | None], str]:
     """Return the mask of each photograph or None, and a message about them ("" if there are none).
 
-    Parameters
-    ----------
-    photos : sequence of Photo
-    root : Path
-        Folder of the photographs. Masks are searched in ``masks`` inside or beside it or in its sub-folders, and as
-        ``STEM_mask.png`` or ``NAME.mask.png``.
-    folder : Path or None
-        Folder of the masks (``--masks``), instead of the search.
-
-    Raises
-    ------
-    DataError
-        If ``folder`` does not exist or holds no mask of these photographs.
+    ``root``: folder of the photographs. Masks are searched in ``masks`` inside or beside it or in its sub-folders, and
+    as ``STEM_mask.png`` or ``NAME.mask.png``. ``folder``: folder of the masks (``--masks``), instead of the search.
+    Raises DataError if ``folder`` does not exist or holds no mask of these photographs.
     """
     if folder is not None and not folder.is_dir():
         raise DataError(f"--masks must be a folder of masks, got {folder}, which does not exist")
@@ -53,10 +43,7 @@ def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[
 def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Path, max_size: int | None) -> int:
     """Write masks as ``folder/NAME.png`` with the size of the copied images; returns their number.
 
-    Raises
-    ------
-    DataError
-        If a mask and its photograph differ in shape, or all masks are completely black.
+    Raises DataError if a mask and its photograph differ in shape, or all masks are completely black.
     """
     count, kept = 0, False
     for photo, path in zip(photos, masks, strict=True):
@@ -89,10 +76,7 @@ def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def _upright(photo: Photo, path: Path) -> np.ndarray:
     """Read a mask, bool [H, W], rotated like its upright photograph.
 
-    Raises
-    ------
-    DataError
-        If its shape differs from that of the photograph.
+    Raises DataError if its shape differs from that of the photograph.
     """
     width, height = photo.size
     stored = (height, width) if photo.orientation >= 5 else (width, height)

@@ -43,27 +43,15 @@ _SHOOTING = "take 30 or more, a step apart, with much overlap"
 
 @dataclass(frozen=True)
 class Photo:
-    """One photograph.
-
-    Attributes
-    ----------
-    source : Path
-    label : str
-        Path relative to the user's folder, with ``/``; used in messages.
-    name : str
-        Path relative to ``images/`` of the capture: UTF-8 without white space, which COLMAP's lists need; ``.png`` if
-        converted.
-    size : (int, int)
-        Width and height of the upright image, px.
-    taken : Taken
-        Metadata of the file; ``orientation`` is the rotation that remains to be applied.
-    """
+    """One photograph."""
 
     source: Path
-    label: str
+    label: str  # path relative to the user's folder, with ``/``; used in messages
+    # Path relative to ``images/`` of the capture: UTF-8 without white space, which COLMAP's lists need; ``.png`` if
+    # converted.
     name: str
-    size: tuple[int, int]
-    taken: Taken
+    size: tuple[int, int]  # width and height of the upright image, px
+    taken: Taken  # metadata of the file; ``orientation`` is the rotation that remains to be applied
 
     @property
     def orientation(self) -> int:
@@ -87,6 +75,8 @@ class Photo:
 def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
     """Find the photographs in a folder and its sub-folders.
 
+    Raises DataError if ``root`` is no folder, or holds too few photographs.
+
     Returns
     -------
     list of Path
@@ -95,11 +85,6 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
         A message about each kind of other files.
     str
         A message about the photographs that cannot be read: how many, why, and the remedy; "" if there are none.
-
-    Raises
-    ------
-    DataError
-        If ``root`` is no folder, or holds too few photographs.
     """
     if root.is_file():
         other = suggestion(root, "photographs")
@@ -170,10 +155,7 @@ def _some(paths: Sequence[Path], root: Path) -> str:
 def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[Photo]:
     """Read and decode each file, so that a broken one is reported before the slow steps.
 
-    Raises
-    ------
-    DataError
-        If a file cannot be decoded.
+    Raises DataError if a file cannot be decoded.
     """
     names = _names([path.relative_to(root).as_posix() for path in paths])
     with ThreadPoolExecutor(threads) as pool:
@@ -212,12 +194,8 @@ def turn(image: Image.Image, orientation: int) -> Image.Image:
 def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cameras: str) -> list[list[int]]:
     """Group photographs (by index) that share a camera.
 
-    "auto": equal folder, size, camera, lens and focal length; "one": all; "each": none.
-
-    Raises
-    ------
-    DataError
-        For "one", if the sizes differ.
+    "auto": equal folder, size, camera, lens and focal length; "one": all; "each": none. Raises DataError for "one", if
+    the sizes differ.
     """
     if cameras == "each":
         return [[i] for i in range(len(photos))]
@@ -240,17 +218,9 @@ def panorama_groups(
 ) -> tuple[list[bool], list[str]]:
     """Return whether each group of photographs consists of panoramas, and messages.
 
-    Parameters
-    ----------
-    groups : sequence of sequences of int
-        Indices of photographs, one group per camera.
-    camera_model : str
-        "auto" reads the XMP of the images, ``PANORAMA`` means that all are panoramas, other values that none is.
-
-    Raises
-    ------
-    DataError
-        If a panorama does not cover the whole sphere.
+    ``groups``: indices of photographs, one group per camera. ``camera_model``: "auto" reads the XMP of the images,
+    ``PANORAMA`` means that all are panoramas, other values that none is. Raises DataError if a panorama does not cover
+    the whole sphere.
     """
     if camera_model not in ("auto", PANORAMA):
         return [False] * len(groups), []

@@ -34,12 +34,7 @@ def is_of(work: Path, layer: str, wanted: Any) -> bool:
 def go_on(work: Path, wanted: Mapping[str, Any], *, ours: Sequence[str]) -> str:
     """Keep the layers of an earlier search whose inputs are equal, remove the others, and store the new inputs.
 
-    Parameters
-    ----------
-    wanted : mapping
-        Inputs of each of ``LAYERS``.
-    ours : sequence of str
-        Folders of the caller that belong to the layer "photographs".
+    ``wanted``: inputs of each of ``LAYERS``. ``ours``: folders of the caller that belong to the layer "photographs".
 
     Returns
     -------

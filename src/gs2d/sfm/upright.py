@@ -13,11 +13,7 @@ def up_direction(rotations: np.ndarray) -> np.ndarray | None:
 
     Photographers hold the camera level but tilt it up and down, so up is perpendicular to the cameras' x axes r_i: the
     unit vector u that minimises mean((r_i . u)^2) - 0.01 (m . u)^2, where m is the mean of the cameras' up vectors.
-
-    Parameters
-    ----------
-    rotations : ndarray [V, 3, 3]
-        World to camera, OpenCV axes: rows are the camera's right, down and forward in the world.
+    ``rotations`` [V, 3, 3]: world to camera, OpenCV axes: rows are the camera's right, down and forward in the world.
     """
     right, mean_up = rotations[:, 0], -rotations[:, 1].mean(axis=0)
     if np.linalg.norm(mean_up) < MIN_AGREEMENT:

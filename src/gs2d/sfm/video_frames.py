@@ -49,10 +49,7 @@ def is_video(path: Path) -> bool:
 def look_into(path: Path) -> Video:
     """Inspect a video.
 
-    Raises
-    ------
-    DataError
-        If there is no such file, no video in it, or no ffmpeg on the PATH.
+    Raises DataError if there is no such file, no video in it, or no ffmpeg on the PATH.
     """
     if not path.is_file():
         raise DataError(f"{path} must be a video or a folder of photographs, got no such file")
@@ -82,10 +79,7 @@ def _streams(text: str) -> list[dict[str, Any]]:
 def sharpness_of(video: Video) -> Generator[float, None, None]:
     """Yield the sharpness of each frame: the variance of the Laplacian of its grey values.
 
-    Raises
-    ------
-    DataError
-        If ffmpeg fails.
+    Raises DataError if ffmpeg fails.
     """
     size = SIDE * SIDE
     scaled = f"scale={SIDE}:{SIDE}:flags=area,format=gray,setpts=N/({_RATE}*TB)"
@@ -111,10 +105,7 @@ def choose(sharpness: Sequence[float], count: int) -> list[int]:
 def take(video: Video, numbers: Sequence[int], folder: Path) -> list[Path]:
     """Write frames as ``frame_NUMBER.jpg`` to a new folder, upright and at full size.
 
-    Raises
-    ------
-    DataError
-        If ffmpeg fails or writes fewer frames.
+    Raises DataError if ffmpeg fails or writes fewer frames.
     """
     folder.mkdir(parents=True)
     wanted = "+".join(f"eq(n,{number})" for number in numbers)
@@ -136,10 +127,7 @@ def take(video: Video, numbers: Sequence[int], folder: Path) -> list[Path]:
 def _decoding(video: Video, options: Sequence[str], into: Path | None = None) -> Iterator[IO[bytes]]:
     """Run ffmpeg in the folder ``into`` and yield its standard output; it is stopped at the end of the block.
 
-    Raises
-    ------
-    DataError
-        If it fails; with the last line of its output.
+    Raises DataError if it fails; with the last line of its output.
     """
     words = ["ffmpeg", "-nostdin", "-v", "error", "-i", _url(video.path), "-map", "0:V:0", *options]
     with tempfile.TemporaryFile() as errors, subprocess.Popen(words, stdout=PIPE, stderr=errors, cwd=into) as job:

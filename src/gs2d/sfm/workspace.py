@@ -73,12 +73,8 @@ def hidden_workspace(out: Path) -> Path:
 def workspace(out: Path) -> Iterator[Path]:
     """Lock the hidden folder of a capture; it is removed at the end, unless it holds an unfinished search.
 
-    It is empty or holds an interrupted search, which ``search.forget`` ends.
-
-    Raises
-    ------
-    RunError
-        If another process creates the same capture.
+    It is empty or holds an interrupted search, which ``search.forget`` ends. Raises RunError if another process creates
+    the same capture.
     """
     work = hidden_workspace(out)
     made = make_folder(work)

@@ -46,26 +46,14 @@ class ColmapCamera:
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """A registered image.
-
-    Attributes
-    ----------
-    image_id, camera_id : int
-    name : str
-        Relative to the image folder.
-    T_cam_world : ndarray [4, 4] float64
-        NaN if the file has no valid pose.
-    observations : ndarray [M, 2] px, or None if not requested
-    point_ids : ndarray [M] int64, or None if not requested
-        -1 = no point.
-    """
+    """A registered image."""
 
     image_id: int
     camera_id: int
-    name: str
-    T_cam_world: np.ndarray
-    observations: np.ndarray | None = None
-    point_ids: np.ndarray | None = None
+    name: str  # relative to the image folder
+    T_cam_world: np.ndarray  # [4, 4] float64; NaN if the file has no valid pose
+    observations: np.ndarray | None = None  # [M, 2] px; None: not requested
+    point_ids: np.ndarray | None = None  # [M] int64, -1 = no point; None: not requested
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +88,7 @@ def read_cameras(folder: Path, kind: str) -> dict[int, ColmapCamera]:
 def read_images(folder: Path, kind: str, *, observations: bool = False) -> list[ColmapImage]:
     """Read the registered images of a model, in file order; ``observations`` includes the 2-D points.
 
-    Raises
-    ------
-    DataError
-        If the file is truncated or invalid, or a pose is not finite.
+    Raises DataError if the file is truncated or invalid, or a pose is not finite.
     """
     images = list(_each_image(folder, kind, observations))
     for image in images:
@@ -395,12 +380,8 @@ def read_colmap(root: Path, downscale: int) -> Capture:
     """Read a COLMAP capture.
 
     Images are in ``images`` beside ``sparse``, or in ``images_N`` if ``downscale`` is N and that folder exists. EXIF
-    orientation is ignored, as in COLMAP.
-
-    Raises
-    ------
-    DataError
-        If the model is missing or invalid, a camera model is not supported, or there is no folder of images.
+    orientation is ignored, as in COLMAP. Raises DataError if the model is missing or invalid, a camera model is not
+    supported, or there is no folder of images.
     """
     found = model_folder(root)
     if found is None:
@@ -467,17 +448,8 @@ class Colmap:
 def observed_points(folder: Path, kind: str, names: Mapping[str, str] | None = None) -> ObservedPoints:
     """Return the points that each image of a model observes.
 
-    Parameters
-    ----------
-    folder : Path
-    kind : str
-    names : mapping of str to str, optional
-        View names by image name in the model; default: the same.
-
-    Raises
-    ------
-    DataError
-        If the model has no points, or a file is invalid.
+    ``names``: view names by image name in the model; default: the same. Raises DataError if the model has no points, or
+    a file is invalid.
     """
     points = read_points(folder, kind)
     if points is None or not len(points.ids):

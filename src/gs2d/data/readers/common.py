@@ -30,10 +30,7 @@ def head(path: Path) -> bytes:
 def parsed(text: str) -> float:
     """Parse a number. ``-nan(ind)`` and ``1.#INF``, as C programs on Windows write them, are NaN.
 
-    Raises
-    ------
-    ValueError
-        If the text is not a number.
+    Raises ValueError if the text is not a number.
     """
     return math.nan if _NO_NUMBER.fullmatch(text) else float(text)
 
@@ -58,24 +55,9 @@ def find_photographs(
 ) -> dict[str, ImageFile]:
     """Find the image file of each name in a camera file; the suffix is optional (see ``Files`` for the rules).
 
-    Parameters
-    ----------
-    names : sequence of str
-    folders : sequence of Path
-        Folders that may contain the images, most likely first.
-    where : Path
-        The camera file.
-    base : Path, optional
-        Base folder of relative paths.
-    homes : sequence of Path, optional
-        Base folders of names in the scene; default: ``folders``.
-    reason : str, optional
-        Reason for a missing file; default: names the camera file.
-
-    Raises
-    ------
-    DataError
-        If several files fit a name equally well.
+    ``folders``: folders that may contain the images, most likely first. ``where``: the camera file. ``base``: base
+    folder of relative paths. ``homes``: base folders of names in the scene; default: ``folders``. ``reason``: reason
+    for a missing file; default: names the camera file. Raises DataError if several files fit a name equally well.
     """
     files = Files(folders, base)
     names = list(dict.fromkeys(names))

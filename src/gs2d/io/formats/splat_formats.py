@@ -25,43 +25,24 @@ Reader = Callable[[str | os.PathLike[str], Tell], tuple[Gaussians, str]]
 
 @dataclass(frozen=True)
 class Layout:
-    """A format in which splats are written.
+    """A format in which splats are written."""
 
-    Attributes
-    ----------
-    ending : str
-        Suffix of the file names. If it begins with /, it is the whole name of a file with others beside it.
-    write : callable
-        Writes a file and returns a message for each thing that the format cannot store.
-    size : callable or None
-        Returns the size in bytes of all files that belong to a written one; None if it is a single file.
-    """
-
-    ending: str
-    write: Writer
+    ending: str  # suffix of the file names. If it begins with /, it is the whole name of a file with others beside it.
+    write: Writer  # writes a file and returns a message for each thing that the format cannot store
+    # Returns the size in bytes of all files that belong to a written one; None if it is a single file.
     size: Callable[[Path], int] | None = None
 
 
 @dataclass(frozen=True)
 class SplatReader:
-    """A format from which splats are read.
+    """A format from which splats are read."""
 
-    Attributes
-    ----------
-    endings : tuple of str
-        Suffixes of the file names; those that begin with / are whole names.
-    read : callable
-        Takes a path and a function that receives messages; returns the Gaussians and a description of the kind of file
-        ("2dgs" for flat splats).
-    ply_kind : str or None
-        Kind of PLY files, from ``splat_ply.ply_kind``, that it reads.
-    mesh : callable or None
-        Returns the facts of a file that contains a mesh instead of splats, or None.
-    """
-
-    endings: tuple[str, ...]
+    endings: tuple[str, ...]  # suffixes of the file names; those that begin with / are whole names
+    # Takes a path and a function that receives messages; returns the Gaussians and a description of the kind of file
+    # ("2dgs" for flat splats).
     read: Reader
-    ply_kind: str | None = None
+    ply_kind: str | None = None  # kind of PLY files, from ``splat_ply.ply_kind``, that it reads
+    # Returns the facts of a file that contains a mesh instead of splats, or None.
     mesh: Callable[[Path], dict[str, Any] | None] | None = None
 
 
@@ -268,12 +249,7 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
     """Read a splat file of any format.
 
     A log scale of -inf is a scale of 0; infinite opacity logits are opaque or empty splats. Splats with other
-    non-finite numbers are dropped, with a note.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, broken, or contains no splats.
+    non-finite numbers are dropped, with a note. Raises DataError if the file is missing, broken, or contains no splats.
     """
     notes: list[str] = []
     reader = reader_of(path)
@@ -321,12 +297,8 @@ def read_surfels(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tu
     """Read splats to start a training from, and describe them.
 
     3D Gaussians lose their smallest scale, whose axis becomes the normal
-    (:meth:`gs2d.io.gaussians.Gaussians.flattened`). ``tell`` is as in ``read_splats``.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, broken, or contains no splats.
+    (:meth:`gs2d.io.gaussians.Gaussians.flattened`). ``tell`` is as in ``read_splats``. Raises DataError if the file is
+    missing, broken, or contains no splats.
     """
     other = {"mesh": "a mesh", "points": "a point cloud"}.get("" if is_splat_file(path) else ply_kind(path))
     if other is not None:
