@@ -7,36 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Arg:
-    """How a field is written on the command line, in ``Annotated``.
+    """How a field is written on the command line, in ``Annotated``."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the option if it differs from the field's: "set" for ``--set``.
-    metavar : str
-        Word for the value in help; empty: by the type.
-    kind : type or None
-        Type that a word is converted to; None: that of the field.
-    bare : str
-        Value of the option if none follows it, where values are numbers; empty: a value must follow.
-    positional : bool
-        Written without a name.
-    repeated : bool
-        One value for each time the option is given.
-    setting : bool
-        Rarely needed: written as ``--set NAME=VALUE``.
-    python_only : bool
-        Not on the command line.
-    """
-
-    name: str = ""
-    metavar: str = ""
-    kind: type | None = None
-    bare: str = ""
-    positional: bool = False
-    repeated: bool = False
-    setting: bool = False
-    python_only: bool = False
+    name: str = ""  # name of the option if it differs from the field's: "set" for ``--set``
+    metavar: str = ""  # word for the value in help; empty: by the type
+    kind: type | None = None  # type that a word is converted to; None: that of the field
+    bare: str = ""  # value of the option if none follows it, where values are numbers; empty: a value must follow
+    positional: bool = False  # written without a name
+    repeated: bool = False  # one value for each time the option is given
+    setting: bool = False  # rarely needed: written as ``--set NAME=VALUE``
+    python_only: bool = False  # not on the command line
 
 
 PYTHON_ONLY = Arg(python_only=True)

@@ -15,43 +15,28 @@ AXES = ("auto", "opencv", "opengl")
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """Source of known depths, and how much they count (``losses/known_maps.py``, ``losses/prior_formulas.py``).
+    """Source of known depths, and how much they count (``losses/known_maps.py``, ``losses/prior_formulas.py``)."""
 
-    Attributes
-    ----------
-    source : str
-        "sparse": sparse points of the capture; "sensor": depth maps in units of the capture times a factor; "relative":
-        depth maps with an unknown scale and shift for each view; "auto": sensor maps, relative maps or sparse points,
-        whichever the capture has first.
-    final_factor, decay_steps : float, int
-        The weight of the loss decays log-linearly to this fraction over ``decay_steps`` iterations of the run, because
-        the images are more accurate in the end.
-    min_track : int
-        Smallest number of images of a sparse point.
-    max_error : float, px
-        Largest mean reprojection error of a sparse point.
-    unit : float or None
-        World units of a value of 1 in a sensor map. None: the unit that fits the sparse points (the scale of COLMAP is
-        arbitrary); without points that of the capture, 0.001 for integers, or 1.
-    space : str
-        Quantity that relative maps are linear in: "disparity" (1 / depth) or "depth"; "auto": the one that fits the
-        sparse points better.
-    align : str
-        Scale and shift of a relative map are fitted to its sparse "points", or to the rendered depth if there are too
-        few; "rendered": always to the rendered depth, in each iteration.
-    start : bool
-        Whether training also starts from points on the maps, as many as the recipe's ``init_points``.
-    """
-
+    # "sparse": sparse points of the capture; "sensor": depth maps in units of the capture times a factor; "relative":
+    # depth maps with an unknown scale and shift for each view; "auto": sensor maps, relative maps or sparse points,
+    # whichever the capture has first
     source: str = "auto"
+    # final_factor, decay_steps: the weight of the loss decays log-linearly to this fraction over ``decay_steps``
+    # iterations of the run, because the images are more accurate in the end
     final_factor: float = 0.01
     decay_steps: int = 30_000
-    min_track: int = 3
-    max_error: float = 2.0
+    min_track: int = 3  # smallest number of images of a sparse point
+    max_error: float = 2.0  # px; largest mean reprojection error of a sparse point
+    # World units of a value of 1 in a sensor map. None: the unit that fits the sparse points (the scale of COLMAP is
+    # arbitrary); without points that of the capture, 0.001 for integers, or 1.
     unit: float | None = None
+    # Quantity that relative maps are linear in: "disparity" (1 / depth) or "depth"; "auto": the one that fits the
+    # sparse points better.
     space: str = "auto"
+    # Scale and shift of a relative map are fitted to its sparse "points", or to the rendered depth if there are too
+    # few; "rendered": always to the rendered depth, in each iteration.
     align: str = "points"
-    start: bool = True
+    start: bool = True  # whether training also starts from points on the maps, as many as the recipe's ``init_points``
 
     def weight_at(self, iteration: int) -> float:
         """Return the factor of the weight at an iteration of the run (1-based)."""
@@ -60,18 +45,12 @@ class DepthPrior:
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """Settings of the loss on known normals.
+    """Settings of the loss on known normals."""
 
-    Attributes
-    ----------
-    axes : str
-        Axes of the maps in the camera frame: "opencv" (x right, y down, z forward), "opengl" (x right, y up, z back) or
-        "auto", those in which normals face the camera.
-    final_factor, decay_steps : float, int
-        See :class:`DepthPrior`.
-    """
-
+    # Axes of the maps in the camera frame: "opencv" (x right, y down, z forward), "opengl" (x right, y up, z back) or
+    # "auto", those in which normals face the camera.
     axes: str = "auto"
+    # final_factor, decay_steps: see :class:`DepthPrior`
     final_factor: float = 0.01
     decay_steps: int = 30_000
 

@@ -21,47 +21,30 @@ RELATIVE_NEAR = 0.01  # [d] of the extent, if a protocol has no near
 
 @dataclass(frozen=True)
 class FusionLimits:
-    """Settings of the fusion of depth maps into a mesh; None is derived from the scene.
+    """Settings of the fusion of depth maps into a mesh; None is derived from the scene."""
 
-    Attributes
-    ----------
-    voxel, truncation : float or None
-        World units. Voxel size, and the distance at which the signed distance saturates.
-    depth_limit : float or None
-        World units. Depths beyond it are ignored.
-    clusters : int
-        Number of largest connected components to keep; 0 keeps all.
-    depth : str or None
-        "mean", "median" or "transmittance": the fused depth; None: that of the losses.
-    subject : bool
-        Mesh what most cameras look at (``data.subject_box``), cleaned and simplified by evidence; False: all that is
-        inside the limits, as the scripts of the data sets do.
-    """
-
+    # voxel, truncation: world units. Voxel size, and the distance at which the signed distance saturates.
     voxel: float | None = None  # [d] from the depth maps, and the next two
     truncation: float | None = None
-    depth_limit: float | None = None
+    depth_limit: float | None = None  # world units. Depths beyond it are ignored.
+    # Number of largest connected components to keep; 0 keeps all.
     clusters: int = 50  # [c] render.py
+    # "mean", "median" or "transmittance": the fused depth; None: that of the losses
     depth: str | None = None  # [c] render.py fuses the depth that was trained
+    # Mesh what most cameras look at (``data.subject_box``), cleaned and simplified by evidence; False: all that is
+    # inside the limits, as the scripts of the data sets do.
     subject: bool = False  # [c] render.py meshes all that is inside the limits
 
 
 @dataclass(frozen=True)
 class MetricConventions:
-    """Conventions of reported image and surface quality.
+    """Conventions of reported image and surface quality."""
 
-    Attributes
-    ----------
-    from_8bit : bool
-        Image metrics on renders quantised to 8 bits, as the official code measures them from PNG files.
-    lpips_unit_range : bool
-        LPIPS of values in [0, 1], as in the official code, instead of the [-1, 1] of the network.
-    surface : str
-        "chamfer" or "f_score": the main figure against ground truth.
-    """
-
+    # Image metrics on renders quantised to 8 bits, as the official code measures them from PNG files.
     from_8bit: bool = True  # [c] metrics.py reads PNG files
+    # LPIPS of values in [0, 1], as in the official code, instead of the [-1, 1] of the network.
     lpips_unit_range: bool = True  # [c] metrics.py
+    # "chamfer" or "f_score": the main figure against ground truth
     surface: str = "f_score"  # [r]
 
 

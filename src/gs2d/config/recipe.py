@@ -155,54 +155,29 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class GradDensify:
-    """Densification by screen gradients: clone, split, prune and reset opacity (official 2DGS, and AbsGS by values).
+    """Densification by screen gradients: clone, split, prune and reset opacity (official 2DGS, and AbsGS by values)."""
 
-    Attributes
-    ----------
-    grad_threshold : float
-        Mean signed screen gradient above which small splats are cloned and large ones split.
-    every, start, stop : int
-        Splats are densified if start < iteration < stop and iteration % every == 0. Statistics are gathered until
-        ``stop``.
-    absolute : bool
-        Whether splits use absolute gradients (AbsGS).
-    abs_threshold : float
-        With ``absolute``: threshold of the absolute gradient for splits. Clones still use the signed gradient.
-    percent_dense : float
-        Splats with max scale <= percent_dense * extent are cloned, larger ones split.
-    opacity_cull : float
-        Splats of lower opacity are pruned.
-    scale_cull_start : int or None
-        Large splats are pruned after this iteration; None = ``reset_every``, as in the official code.
-    reset_every : int
-        Iterations between opacity resets, before ``stop``; 0 = no resets.
-    reset_at_start_on_white : bool
-        With ``reset_every``, also reset at iteration ``start`` if the background is white, as in the official code.
-    last_reset : int or None
-        No reset after this iteration; None = any before ``stop``.
-    prune_grace : int
-        Iterations after a reset in which no splat is pruned by opacity (0 in the official code).
-    cap_every : int
-        Iterations between caps of the opacity, as in AbsGS; 0 = no caps.
-    max_splats : int or None
-        No densification exceeds this count. If more splats qualify, those with the largest ratio of signal to threshold
-        win. None = no limit.
-    """
-
-    grad_threshold: float = 2e-4
+    grad_threshold: float = 2e-4  # mean signed screen gradient above which small splats are cloned and large ones split
+    # every, start, stop: splats are densified if start < iteration < stop and iteration % every == 0. Statistics are
+    # gathered until ``stop``.
     every: int = 100
     start: int = 500
     stop: int = 15_000
-    absolute: bool = False
+    absolute: bool = False  # whether splits use absolute gradients (AbsGS)
+    # With ``absolute``: threshold of the absolute gradient for splits. Clones still use the signed gradient.
     abs_threshold: float = 4e-4
-    percent_dense: float = 0.01
-    opacity_cull: float = 0.05
-    reset_every: int = 3_000
+    percent_dense: float = 0.01  # splats with max scale <= percent_dense * extent are cloned, larger ones split
+    opacity_cull: float = 0.05  # splats of lower opacity are pruned
+    reset_every: int = 3_000  # iterations between opacity resets, before ``stop``; 0 = no resets
+    # With ``reset_every``, also reset at iteration ``start`` if the background is white, as in the official code.
     reset_at_start_on_white: bool = True
-    last_reset: int | None = None
-    prune_grace: int = 0
-    cap_every: int = 0
+    last_reset: int | None = None  # no reset after this iteration; None = any before ``stop``
+    prune_grace: int = 0  # iterations after a reset in which no splat is pruned by opacity (0 in the official code)
+    cap_every: int = 0  # iterations between caps of the opacity, as in AbsGS; 0 = no caps
+    # No densification exceeds this count. If more splats qualify, those with the largest ratio of signal to threshold
+    # win. None = no limit.
     max_splats: int | None = None
+    # Large splats are pruned after this iteration; None = ``reset_every``, as in the official code.
     scale_cull_start: int | None = None
 
     def resets(self, iteration: int, *, white: bool) -> bool:

@@ -19,32 +19,18 @@ class DenseStart:
 
     Sparse points of the capture give the depth range. Without any, the scene bounds do, inside the silhouettes of
     images with an alpha channel (``training/start/sweep_range.py``).
-
-    Attributes
-    ----------
-    side : int, px
-        Images are downscaled by a whole factor until their longer side is about this.
-    neighbours : int
-        Images that each image is compared with. The best two count, so that a point may be hidden from the others.
-    min_angle : float, degrees
-        Smallest angle between the viewing directions of neighbours.
-    cell : float, px
-        One splat starts in each cell of this many pixels of the downscaled images.
-    fit : bool
-        Whether colour, opacity and size of the splats are fitted to the images (``training/start/start_fit.py``).
-        Otherwise they start as splats of sparse points do.
-    required : bool
-        Whether training stops if no depths agree. Otherwise it reports that and starts without.
-    sphere : bool
-        Whether splats on a sphere around the scene are added (``training/start/background_sphere.py``).
     """
 
-    side: int = 200
+    side: int = 200  # px; images are downscaled by a whole factor until their longer side is about this
+    # Images that each image is compared with. The best two count, so that a point may be hidden from the others.
     neighbours: int = 4
-    min_angle: float = 2.0
-    cell: float = 3.0
+    min_angle: float = 2.0  # degrees; smallest angle between the viewing directions of neighbours
+    cell: float = 3.0  # px; one splat starts in each cell of this many pixels of the downscaled images
+    # Whether colour, opacity and size of the splats are fitted to the images (``training/start/start_fit.py``).
+    # Otherwise they start as splats of sparse points do.
     fit: bool = False
-    required: bool = True
+    required: bool = True  # whether training stops if no depths agree. Otherwise it reports that and starts without.
+    # Whether splats on a sphere around the scene are added (``training/start/background_sphere.py``).
     sphere: bool = False
 
 
@@ -54,25 +40,17 @@ class Removal:
 
     Depth maps, sizes and colours only propose splats; the training images decide (``training/robust/trial.py``). In the
     same iterations, large splats on surfaces of known depth shrink (docs/notebook/floaters.md).
-
-    Attributes
-    ----------
-    every : int
-        Iterations between proposals, and from the start to the first.
-    decay : float
-        Fraction of its opacity that a splat loses every ten iterations, in stages that train the opacity of all splats.
-        Splats that several images need recover at once; floaters that only one image supports do not.
-    dropout : float
-        Fraction of the splats that each iteration leaves out at random, with at most ``FEW_VIEWS`` training images.
-        With more, dropout gains on some captures and loses on others.
-    backdrop : bool
-        Also propose splats in the colour of the background. Set for captures in front of an even, unlit backdrop, where
-        such splats change no training image and hide what new views should show.
     """
 
-    every: int = 50
+    every: int = 50  # iterations between proposals, and from the start to the first
+    # Fraction of its opacity that a splat loses every ten iterations, in stages that train the opacity of all splats.
+    # Splats that several images need recover at once; floaters that only one image supports do not.
     decay: float = 0.01
+    # Fraction of the splats that each iteration leaves out at random, with at most ``FEW_VIEWS`` training images. With
+    # more, dropout gains on some captures and loses on others.
     dropout: float = 0.1
+    # Also propose splats in the colour of the background. Set for captures in front of an even, unlit backdrop, where
+    # such splats change no training image and hide what new views should show.
     backdrop: bool = False
 
 

@@ -52,42 +52,23 @@ _FARTHEST = 1e12  # world units from the origin; its cube is still a float32 num
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PosedImage:
-    """An image file with its camera.
+    """An image file with its camera."""
 
-    Attributes
-    ----------
-    name : str
-        Unique, with ``/``.
-    path : Path
-    intrinsics : Intrinsics
-        For the image size that the capture states.
-    T_cam_world : ndarray [4, 4]
-    split : "train", "test" or None
-        None: the capture has no split.
-    mask, object_mask : Path or None
-        Image files; white = used, white = object.
-    alpha_is_silhouette : bool
-        Use the alpha channel as the object mask and keep the image opaque, because the background is real (DTU as
-        2DGS ships it).
-    maps : MapFiles or None
-        Depth and normal maps.
-    mask_is_alpha : bool
-        Use the mask as the alpha channel: masked pixels are empty.
-    face : Face or None
-        Pinhole face of a wide image. ``name`` and ``T_cam_world`` are those of the face, ``path`` and ``intrinsics``
-        those of the image.
-    """
-
-    name: str
+    name: str  # unique, with ``/``
     path: Path
-    intrinsics: Intrinsics
-    T_cam_world: np.ndarray
-    split: str | None = None
+    intrinsics: Intrinsics  # for the image size that the capture states
+    T_cam_world: np.ndarray  # [4, 4]
+    split: str | None = None  # "train", "test"; None: the capture has no split
+    # mask, object_mask: image files; white = used, white = object
     mask: Path | None = None
     object_mask: Path | None = None
+    # Use the alpha channel as the object mask and keep the image opaque, because the background is real (DTU as 2DGS
+    # ships it).
     alpha_is_silhouette: bool = False
-    maps: MapFiles | None = None
-    mask_is_alpha: bool = False
+    maps: MapFiles | None = None  # depth and normal maps
+    mask_is_alpha: bool = False  # use the mask as the alpha channel: masked pixels are empty
+    # Pinhole face of a wide image. ``name`` and ``T_cam_world`` are those of the face, ``path`` and ``intrinsics``
+    # those of the image.
     face: Face | None = None
 
 

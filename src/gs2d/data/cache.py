@@ -23,23 +23,12 @@ TRIM_EVERY = 16  # decoded images between two calls of trim(), which take a few 
 
 @dataclass(frozen=True, eq=False)
 class DecodedImage:
-    """A decoded image with its masks; the arrays are shared and therefore read-only.
+    """A decoded image with its masks; the arrays are shared and therefore read-only."""
 
-    Attributes
-    ----------
-    image : ndarray uint8 [H, W, 3 or 4]
-        sRGB, straight alpha in the fourth channel.
-    mask : ndarray bool [H, W] or None
-        False = ignore this pixel.
-    object_mask : ndarray bool [H, W] or None
-        True = the object.
-    valid : ndarray bool [H, W] or None
-        False = outside the photograph after undistortion (black). None: all valid.
-    """
-
-    image: np.ndarray
-    mask: np.ndarray | None = None
-    object_mask: np.ndarray | None = None
+    image: np.ndarray  # uint8 [H, W, 3 or 4]; sRGB, straight alpha in the fourth channel
+    mask: np.ndarray | None = None  # bool [H, W]; False = ignore this pixel
+    object_mask: np.ndarray | None = None  # bool [H, W]; True = the object
+    # bool [H, W]; False = outside the photograph after undistortion (black). None: all valid.
     valid: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -77,11 +66,7 @@ class ImageCache:
     file cannot be written, images are decoded again. Decoding happens outside the lock: threads decode different images
     in parallel; two threads that request the same image may both decode it.
 
-    Parameters
-    ----------
-    max_bytes : int
-    spills : bool
-        False: dropped images are decoded again.
+    ``spills`` False: dropped images are decoded again.
     """
 
     def __init__(self, max_bytes: int, *, spills: bool = False) -> None:

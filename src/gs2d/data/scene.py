@@ -170,21 +170,12 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Sparse points.
+    """Sparse points."""
 
-    Attributes
-    ----------
-    points : ndarray [P, 3] float64 world units
-    colors : ndarray [P, 3] uint8 sRGB, or None
-    normals : ndarray [P, 3] or None
-        Unit surface normals of either sign; 0 = unknown.
-    sizes : ndarray [P] float64 world units, or None
-        Standard deviations of the initial splats; 0: from the distance of neighbouring points.
-    """
-
-    points: np.ndarray
-    colors: np.ndarray | None = None
-    normals: np.ndarray | None = None
+    points: np.ndarray  # [P, 3] float64 world units
+    colors: np.ndarray | None = None  # [P, 3] uint8 sRGB
+    normals: np.ndarray | None = None  # [P, 3]; unit surface normals of either sign; 0 = unknown
+    # [P] float64 world units; standard deviations of the initial splats; 0: from the distance of neighbouring points
     sizes: np.ndarray | None = None
 
     def __post_init__(self) -> None:

@@ -45,28 +45,15 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What the cameras look at, in the coordinates of the capture.
+    """What the cameras look at, in the coordinates of the capture."""
 
-    Attributes
-    ----------
-    kind : str
-        "object", or "scene": no common target, the box contains everything visible.
-    low, high : ndarray [3] world units
-        Corners of the box.
-    center : ndarray [3] world units
-        Mean of the votes, not the centre of the box.
-    up : ndarray [3]
-        Unit up vector.
-    why : str
-        Reason, in one sentence.
-    """
-
-    kind: str
+    kind: str  # "object", or "scene": no common target, the box contains everything visible
+    # low, high: [3] world units; corners of the box
     low: np.ndarray
     high: np.ndarray
-    center: np.ndarray
-    up: np.ndarray
-    why: str
+    center: np.ndarray  # [3] world units; mean of the votes, not the centre of the box
+    up: np.ndarray  # [3]; unit up vector
+    why: str  # reason, in one sentence
 
     @property
     def radius(self) -> float:
@@ -94,10 +81,7 @@ class Subject:
     def from_json(cls, data: Mapping[str, Any]) -> Subject:
         """Convert the result of ``to_json``.
 
-        Raises
-        ------
-        DataError
-            If a field is missing or invalid.
+        Raises DataError if a field is missing or invalid.
         """
         try:
             low, high, center, up = (np.asarray(data[name], np.float64) for name in ("min", "max", "center", "up"))
