@@ -54,12 +54,12 @@ INSIDE = {
         "known_captures": 10,
         "readers": 8,
         "build": 7,
-        "bounds reach": 6,
+        "bounds": 6,
         "scene": 5,
         "prior_maps faces masks": 4,
         "cache exif file_names undistort": 3,
-        "camera_models image_files photo_formats positions": 2,
-        "arrays csv_tables": 1,
+        "camera_models image_files positions": 2,
+        "arrays": 1,
     },
     "losses": {
         "prior_terms": 3,
@@ -68,7 +68,6 @@ INSIDE = {
         "formulas": 0,
     },
     "pipeline": {
-        "file_mesh": 7,
         "in_memory reconstruct": 6,
         "train": 5,
         "finish": 4,

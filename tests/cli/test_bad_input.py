@@ -173,9 +173,11 @@ def test_options_that_make_no_sense_give_one_line_and_leave_nothing(
         (["--subject-box", "0", "0", "0", "1", "inf", "1"], "corner"),
         (["--subject-box", "90", "90", "90", "91", "91", "91"], "splats"),
         (["--subject-box", "0", "0", "0", "1", "1", "1", "--method", "unbounded"], "exclude"),
+        (["--method", "tsfd"], "--method: mesh method must be one of tsdf, "),
+        (["--method", "tsfd", "--texture", "--out", "new.glb"], "'tsfd'; did you mean tsdf?"),
     ],
 )
-def test_a_box_that_makes_no_sense_changes_nothing_in_the_run(
+def test_a_box_or_method_that_makes_no_sense_changes_nothing_in_the_run(
     words: list[str], named: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     copy = Path(shutil.copytree(trained, tmp_path / "run"))

@@ -15,7 +15,7 @@ from capture_writers import small_blender, small_colmap, small_nerfstudio
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
 from gs2d.data import load_scene
 from gs2d.data.file_names import Files
-from gs2d.data.photo_formats import HEIF
+from gs2d.data.image_files import HEIF
 
 
 def files(root: Path, *names: str) -> None:

@@ -18,10 +18,9 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.tsdf import FusionOnDevice
 from gs2d.meshing.tsdf_volume import Add, Volume, integrator
 from gs2d.pipeline.finish.run_mesh import extract_mesh, mesh_run
-from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
+from gs2d.pipeline.prepare.loaded import check_same_run, finished_splats, reload_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.resolve import with_fused_depth
-from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.train_run import train
 from gs2d.render.backends import get_backend
 from gs2d.training.events import Event, Notice, Phase, Step

@@ -15,7 +15,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import write_splats
 from gs2d.io.meshes import read_mesh
-from gs2d.pipeline.file_mesh import mesh_file
+from gs2d.pipeline.finish.run_mesh import mesh_file
 from gs2d.pipeline.finish.viewpoints import choose_viewpoints
 from gs2d.pipeline.look.page import settings_without_run
 from gs2d.pipeline.prepare.options import MeshOptions

@@ -9,9 +9,8 @@ import pytest
 
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import write_layout
-from gs2d.pipeline.prepare.loaded import prepare_run
+from gs2d.pipeline.prepare.loaded import check_same_run, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 from train_toys import random_splats

@@ -22,12 +22,11 @@ from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.pipeline.prepare.loaded import check_same_run, reload_run
 from gs2d.pipeline.prepare.open_capture import OpenCapture
 from gs2d.pipeline.prepare.options import Training
 from gs2d.pipeline.prepare.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, resolve, robust_and_exposure
-from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.render.backends import get_backend
 from gs2d.training.events import Event, Notice, OnEvent
 

@@ -14,7 +14,7 @@ from gs2d.data import load_scene
 from gs2d.data.image_files import read_mask
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
-from gs2d.sfm.photo_masks import copy_masks, masks_of
+from gs2d.sfm.copies import copy_masks, masks_of
 from gs2d.sfm.photos import Photo, find_photos, read_photos
 from gs2d.sfm.workspace import hidden_workspace
 from gs2d.training.events import Event, Notice

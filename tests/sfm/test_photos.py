@@ -9,13 +9,12 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 
 from gs2d.core.camera import look_at
-from gs2d.data.image_files import read_image
-from gs2d.data.photo_formats import HEIF
+from gs2d.data.image_files import HEIF, read_image
 from gs2d.errors import DataError
-from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.pairs import near_pairs, neighbour_pairs, similar_pairs
+from gs2d.sfm.colmap_worker import up_direction
+from gs2d.sfm.compare import near_pairs, neighbour_pairs, similar_pairs
+from gs2d.sfm.copies import copy_images
 from gs2d.sfm.photos import Photo, camera_groups, find_photos, in_order_taken, read_photos, turn
-from gs2d.sfm.upright import up_direction
 
 DETAILS = ExifTags.IFD.Exif
 

@@ -130,7 +130,7 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
     if command.run is not None:
         result = mesh_run(command.run, options, console.on_event, out=out, threads=threads)
     elif command.splats is not None and not command.texture:
-        from gs2d.pipeline.file_mesh import mesh_file
+        from gs2d.pipeline.finish.run_mesh import mesh_file
 
         result = mesh_file(command.splats, options, console.on_event, out=out, cameras=command.cameras, threads=threads)
     else:

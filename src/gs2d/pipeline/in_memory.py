@@ -24,13 +24,13 @@ from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.finish.run_mesh import fused
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.scoring import score_views
-from gs2d.pipeline.prepare.loaded import Trained
+from gs2d.pipeline.prepare.loaded import Trained, trained_elsewhere
 from gs2d.pipeline.prepare.open_capture import capture_in_memory
 from gs2d.pipeline.prepare.options import MeshOptions, Training
 from gs2d.pipeline.prepare.predicted_exposure import predicted
 from gs2d.pipeline.prepare.resolve import recipe_of, resolve
 from gs2d.training.events import Event, Notice, OnEvent, Progress, StageStarted, ignore
-from gs2d.training.trainer import Trainer, raster_settings
+from gs2d.training.trainer import Trainer
 
 __all__ = ["Trained", "evaluate", "extract_mesh", "train"]
 
@@ -111,9 +111,7 @@ def _finished(
         return trained
     if scene is None:
         raise DataError("splats need the scene that they belong to; pass it as the second argument")
-    opened = capture_in_memory(scene, protocol, backend, on_event)
-    settings = raster_settings(opened.protocol, scene.extent, trained.sh_degree)
-    return Trained(trained.to(opened.backend.device), scene, opened.protocol, settings, opened.backend)
+    return trained_elsewhere(trained, scene, protocol, backend, on_event)
 
 
 def evaluate(

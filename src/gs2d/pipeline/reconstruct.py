@@ -18,10 +18,10 @@ from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, make_folder
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import attempted_file
 from gs2d.pipeline.finish.run_texture import PACKAGE, texture_run
+from gs2d.pipeline.prepare.loaded import difference
 from gs2d.pipeline.prepare.options import (
     Effort,
     HowItRuns,
-    PoseEstimation,
     PosesOptions,
     ReconstructOptions,
     Resources,
@@ -37,7 +37,6 @@ from gs2d.pipeline.prepare.pose_finding import (
     requested_options,
 )
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.train.train_run import check_places, train
 from gs2d.sfm.colmap_process import check_installed
 from gs2d.sfm.photos import find_photos
@@ -50,17 +49,9 @@ CAPTURE = "capture"
 
 def poses_options(options: ReconstructOptions) -> PosesOptions:
     """Return the options of ``gs2d poses``, which writes the capture into the run folder."""
-    estimation = values(PoseEstimation, options)
-    if options.masked == OFF:
-        estimation["match_masked"] = True
-    return PosesOptions(
-        photos=options.photos,
-        out=options.out / CAPTURE,
-        threads=options.threads,
-        seed=options.seed,
-        overwrite=options.overwrite,
-        **estimation,
-    )
+    match_masked = options.match_masked or options.masked == OFF
+    changed = {"out": options.out / CAPTURE, "match_masked": match_masked}
+    return PosesOptions(**{**values(PosesOptions, options), **changed})
 
 
 def train_options(options: ReconstructOptions) -> TrainOptions:

@@ -20,6 +20,7 @@ from typing import IO, Any
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import install
 from gs2d.errors import BackendError, DataError
+from gs2d.sfm.search import count, read_only
 
 OnProgress = Callable[[str, int, int], None]  # name of the phase, finished steps, total steps
 OnNote = Callable[[str], None]  # a message to show
@@ -180,14 +181,10 @@ def _read_lines(pipe: IO[str], lines: queue.Queue[str | None]) -> None:
 
 
 def _rows(database: Path, table: str) -> int:
-    """Count the rows of a table while COLMAP writes it (in WAL mode, readers do not block it); 0 if unreadable."""
-    with contextlib.suppress(sqlite3.Error), contextlib.closing(_open(database)) as connection:
-        return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    """Count the rows of a table while COLMAP writes it; 0 if unreadable."""
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(read_only(database)) as connection:
+        return count(connection, table)
     return 0
-
-
-def _open(database: Path) -> sqlite3.Connection:
-    return sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=1.0)
 
 
 def _last_words(phase: str, code: int, log: Path) -> str:
@@ -216,7 +213,7 @@ def read_facts(database: Path) -> MatchFacts:
     DataError if it cannot be read. SQLite needs free disk space to read a database that another process wrote.
     """
     try:
-        with contextlib.closing(_open(database)) as connection:
+        with contextlib.closing(read_only(database)) as connection:
             names = dict(connection.execute("SELECT image_id, name FROM images"))
             features = dict.fromkeys(names.values(), 0)
             features |= {names[i]: rows for i, rows in connection.execute("SELECT image_id, rows FROM keypoints")}

@@ -20,14 +20,30 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.similarity import rotation_to_z
-from gs2d.sfm.as_fisheye import settle_fisheyes
 from gs2d.sfm.compare import find_features, match
-from gs2d.sfm.lens import RICH, START, with_rich_lenses
-from gs2d.sfm.mapping import extend, map_globally, map_incrementally
-from gs2d.sfm.panoramas import PANORAMA
+from gs2d.sfm.fisheye import settle_fisheyes
+from gs2d.sfm.lens import PANORAMA, RICH, START, with_rich_lenses
+from gs2d.sfm.mapping import Steps, extend, map_globally, map_incrementally
 from gs2d.sfm.search import FISHEYES, MAPPING
-from gs2d.sfm.steps import Steps
-from gs2d.sfm.upright import up_direction
+
+MIN_AGREEMENT = 0.3  # smallest length of the mean of the cameras' up vectors
+_TOWARDS_MEAN = 0.01  # decides if all right vectors are parallel, negligible otherwise
+
+
+def up_direction(rotations: np.ndarray) -> np.ndarray | None:
+    """Return the up direction as a unit vector [3] in the world; None if the cameras do not agree.
+
+    Photographers hold the camera level but tilt it up and down, so up is perpendicular to the cameras' x axes r_i: the
+    unit vector u that minimises mean((r_i . u)^2) - 0.01 (m . u)^2, where m is the mean of the cameras' up vectors.
+    ``rotations`` [V, 3, 3]: world to camera, OpenCV axes: rows are the camera's right, down and forward in the world.
+    """
+    right, mean_up = rotations[:, 0], -rotations[:, 1].mean(axis=0)
+    if np.linalg.norm(mean_up) < MIN_AGREEMENT:
+        return None
+    spread = right.T @ right / len(right) - _TOWARDS_MEAN * np.outer(mean_up, mean_up)
+    up = np.linalg.eigh(spread)[1][:, 0]
+    return np.asarray(up if up @ mean_up > 0 else -up)
+
 
 Say = Callable[..., None]
 REPEATABLE = 50  # images: up to this many, one thread places them and the same seed gives the same bytes

@@ -13,6 +13,10 @@ from typing import Any
 
 import numpy as np
 
+# Panoramas (``data.exif.Taken.panorama``) are placed with COLMAP's spherical camera, one pose each; training cuts them
+# into faces (``data.faces``).
+PANORAMA = "EQUIRECTANGULAR"
+FINER = 2  # times feature_size: a panorama covers four times the field of view of a photograph
 START, RICH = "SIMPLE_RADIAL", "RADIAL"
 ENOUGH = 8  # images of one camera, for a second coefficient of distortion
 BEND = 0.5  # largest plausible displacement of a corner, relative to its radius; action cameras reach 0.4

@@ -22,7 +22,7 @@ from gs2d.data.readers.colmap import (
 from gs2d.data.undistort import colmap_intrinsics
 from gs2d.errors import DataError
 from gs2d.sfm.colmap_process import MatchFacts
-from gs2d.sfm.panoramas import PANORAMA
+from gs2d.sfm.lens import PANORAMA
 
 _MAX_ANGLES = 2000
 FEW_FEATURES = 50  # of an image: too few for a match

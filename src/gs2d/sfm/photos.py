@@ -13,11 +13,10 @@ from PIL import Image
 from gs2d.core.image_arrays import is_twice_as_wide, natural_key
 from gs2d.core.missing import belongs_to_run, path_hint, suggestion
 from gs2d.data.exif import Taken, read_taken
-from gs2d.data.image_files import read_image
+from gs2d.data.image_files import AVIF, HEIF, UNREAD, read_image, remedy
 from gs2d.data.masks import FOLDER, without_masks
-from gs2d.data.photo_formats import AVIF, HEIF, UNREAD, remedy
 from gs2d.errors import DataError
-from gs2d.sfm.panoramas import PANORAMA
+from gs2d.sfm.lens import PANORAMA
 from gs2d.sfm.video_frames import VIDEOS
 
 JPEG, PNG = (".jpg", ".jpeg"), (".png",)

@@ -102,20 +102,22 @@ def _clear(database: Path) -> None:
 def _kept(work: Path, layers: int) -> str:
     """Describe what exists of the first ``layers`` layers."""
     parts = []
-    with contextlib.suppress(*DAMAGED), contextlib.closing(_open(work / DATABASE)) as connection:
+    with contextlib.suppress(*DAMAGED), contextlib.closing(read_only(work / DATABASE)) as connection:
         if layers > LAYERS.index("features"):
-            parts.append(f"features of {_count(connection, 'keypoints'):,} photographs")
+            parts.append(f"features of {count(connection, 'keypoints'):,} photographs")
         if layers > LAYERS.index("pairs"):
-            parts.append(f"{_count(connection, 'two_view_geometries'):,} pairs")
+            parts.append(f"{count(connection, 'two_view_geometries'):,} pairs")
     if layers > LAYERS.index("mapping") and (work / MAPPING).is_dir():
         steps = {path.stem for path in (work / MAPPING).iterdir()} - {FISHEYES, CALIBRATED_ANEW}
         parts += ["placed cameras"] if steps else []
     return f"continuing the interrupted search: {', '.join(parts) or 'copies of photographs'}"
 
 
-def _open(database: Path) -> sqlite3.Connection:
+def read_only(database: Path) -> sqlite3.Connection:
+    """Open a database; in WAL mode, readers do not block the process that writes it."""
     return sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=1.0)
 
 
-def _count(connection: sqlite3.Connection, table: str) -> int:
+def count(connection: sqlite3.Connection, table: str) -> int:
+    """Count the rows of a table."""
     return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.data.csv_tables import read_table
+from gs2d.data.positions import read_table
 from gs2d.errors import DataError
 
 COLUMNS = ("name", "x", "y", "z")

@@ -39,10 +39,9 @@ from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance
 from gs2d.pipeline.prepare.limits import use_memory, use_threads
-from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
+from gs2d.pipeline.prepare.loaded import LoadedRun, difference, finished_splats
 from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Notice, OnEvent, ignore
 

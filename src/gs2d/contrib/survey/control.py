@@ -12,7 +12,7 @@ import numpy as np
 
 from gs2d.contrib.survey.triangulate import triangulate
 from gs2d.data import View
-from gs2d.data.csv_tables import WGS84, Table, read_table
+from gs2d.data.positions import WGS84, Table, read_table
 from gs2d.errors import DataError
 
 _ODM = ("x", "y", "z", "u", "v", "photo", "name")  # columns of gcp_list.txt

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.data.file_names import IMAGES, NO_PHOTOGRAPHS, Files, name_below
-from gs2d.data.photo_formats import UNREAD, remedy
+from gs2d.data.image_files import UNREAD, remedy
 from gs2d.errors import DataError
 
 _NO_NUMBER = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)

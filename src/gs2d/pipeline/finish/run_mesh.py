@@ -13,14 +13,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.core.atomic_files import disk_error
+from gs2d.config.protocols import get_protocol
+from gs2d.core.atomic_files import check_writable, disk_error
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.mesh import Mesh
-from gs2d.core.transforms import up_direction
-from gs2d.data import View
-from gs2d.data.reach import Reach
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import camera_extent, up_direction
+from gs2d.data import Scene, View, detect_format, load_scene
+from gs2d.data.bounds import Reach
 from gs2d.data.subject_box import LARGEST, Subject, checked_box
-from gs2d.errors import ProtocolError
+from gs2d.errors import DataError, ProtocolError, RunError
+from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.io.meshes import write_mesh, write_pieces
 from gs2d.io.run_dir import MESH, SURFACE, TEXTURED, RunFolder
 from gs2d.kernels.library import ready_library
@@ -35,10 +38,13 @@ from gs2d.meshing.texture import ColorSource
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
 from gs2d.meshing.warped_ncc import GreyImage
 from gs2d.pipeline.finish.run_report import show_again
-from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
+from gs2d.pipeline.finish.run_subject import OPAQUE, centers_inside, meshed_subject
 from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, usable_pixels, within_reach
-from gs2d.pipeline.prepare.limits import release, release_buffers
-from gs2d.pipeline.prepare.loaded import Trained, checked_output, open_finished
+from gs2d.pipeline.finish.viewpoints import choose_viewpoints
+from gs2d.pipeline.look.page import settings_without_run
+from gs2d.pipeline.prepare.limits import release, release_buffers, use_threads
+from gs2d.pipeline.prepare.loaded import Trained, checked_output, open_finished, trained_elsewhere
+from gs2d.pipeline.prepare.open_capture import choose_backend
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.pipeline.prepare.predicted_exposure import LUMA
 from gs2d.render.types import RenderOutput
@@ -56,7 +62,7 @@ LEAST_SLAB_BYTES = 32 << 20  # smaller slabs spend most of the time on preparing
 MOSTLY_CUT = 0.5  # fraction of the depth outside the mesh from which a notice is sent
 COARSER_ERROR = 4.0  # times that of the level of detail before: about a quarter of its faces
 COARSER = 3  # attempts with larger voxels: the first size is an estimate
-LEAST_VIEWS = 2
+LEAST_VIEWS = 2  # one does not measure depth
 
 
 # -- extraction --------------------------------------------------------------------------------------------------------
@@ -160,7 +166,9 @@ def check_mesh_options(options: MeshOptions) -> None:
         raise ProtocolError(f"lods must be a whole number >= 1, got {options.lods}")
     if options.collision:
         required()  # before minutes are spent
-    MESH_METHODS.get(options.method)
+    if options.method not in MESH_METHODS:
+        raise ProtocolError(f"--method: {MESH_METHODS.unknown(options.method)}")
+    MESH_METHODS.get(options.method)  # its package can be imported
     if options.watertight and options.method not in ("tsdf", "delaunay"):
         raise ProtocolError(f"--watertight uses --method delaunay, got {options.method}; leave one of them out")
     if options.bbox is not None:
@@ -309,6 +317,7 @@ def mesh_run(
 ) -> dict[str, Any]:
     """Extract the mesh of a finished run; return its file, counts and limits."""
     path, out = Path(path), None if out is None else Path(out)
+    check_mesh_options(options)
     checked_mesh_file(path, path / MESH if out is None else out, options)
     run, trained = open_finished(path, threads, on_event)
     own = run.file(MESH)
@@ -332,3 +341,78 @@ def mesh_run(
 def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:
     """Write the facts of a run's mesh into ``metrics.json``."""
     run.write_metrics({**run.metrics(), "mesh": {name: result[name] for name in KEPT if name in result}})
+
+
+# -- the mesh of a file of splats --------------------------------------------------------------------------------------
+LONGEST = 1600  # px: photographs of a capture are shrunk to it, as in training at full quality
+
+
+def mesh_file(
+    splats_file: Path,
+    options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    out: Path | None,
+    cameras: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Mesh the splats of a file of any format; return the mesh file ``out``, counts and limits.
+
+    3D Gaussians become disks across their shortest axes. ``cameras`` is a capture in the frame of the splats, whose
+    training views are rendered; None: ``choose_viewpoints``. Raises RunError, DataError or ProtocolError if a file, the
+    capture or an option is invalid.
+    """
+    if out is None:
+        raise RunError("--splats needs --out FILE, the mesh to write")
+    check_mesh_options(options)
+    out = checked_mesh_file(Path(splats_file).parent, Path(out), options)
+    check_writable(out)
+    use_threads(threads)
+    splats, kind = read_surfels(splats_file, lambda text: on_event(Notice(text)))
+    on_event(Notice(f"{len(splats):,} splats: {kind}", detail=True))
+    if options.bbox is not None:
+        centers_inside(splats, options.bbox, "--bbox")
+    if cameras is None:
+        trained, box = _around(splats, on_event)
+        options = replace(options, refine=False)  # there are no photographs
+    else:
+        trained, box = _photographed(splats, Path(cameras), on_event), None
+    near = None if box is None else box.ravel().tolist()
+    subject = meshed_subject(None, trained, options, on_event, box=near)
+    return extract_mesh(trained, options, out, on_event, subject=subject)
+
+
+def _photographed(splats: Splats, capture: Path, on_event: OnEvent) -> Trained:
+    """Return the splats with the views of a capture."""
+    kind = detect_format(capture)
+    scene = load_scene(capture, format=kind, test_every=0)
+    longest = max((max(view.camera.width, view.camera.height) for view in scene.train), default=1)
+    if longest > LONGEST:
+        scene = load_scene(capture, format=kind, test_every=0, downscale=-(-longest // LONGEST))
+    if len(scene.train) < LEAST_VIEWS:
+        raise DataError(
+            f"--cameras must be a capture with {LEAST_VIEWS} or more views, got {len(scene.train)} in {capture}"
+        )
+    return trained_elsewhere(splats, scene, "auto", "auto", on_event)
+
+
+def _around(splats: Splats, on_event: OnEvent) -> tuple[Trained, np.ndarray | None]:
+    """Return the splats with views of chosen cameras, and the box of the subject [2, 3], if there is one."""
+    on_event(Phase("choosing viewpoints", 0))
+    protocol, backend = get_protocol("generic"), choose_backend("auto", on_event)
+    splats = splats.to(backend.device)
+    settings = settings_without_run(splats).for_depths(protocol.fused_depth)
+    chosen = choose_viewpoints(splats, settings, backend)
+    on_event(Notice(f"{len(chosen.cameras)} viewpoints {chosen.why}; --cameras CAPTURE sets them"))
+    centers = np.stack([camera.center for camera in chosen.cameras])
+    image = np.zeros((chosen.cameras[0].height, chosen.cameras[0].width, 3), np.uint8)  # of all views
+    scene = Scene(
+        name="splats",
+        format="",
+        train=tuple(View.from_arrays(f"view{n:03d}", camera, image) for n, camera in enumerate(chosen.cameras)),
+        test=(),
+        points=None,
+        extent=camera_extent(chosen.cameras),
+        bounds=np.stack([centers.min(axis=0), centers.max(axis=0)]),
+    )
+    return Trained(splats, scene, protocol, settings, backend), chosen.box

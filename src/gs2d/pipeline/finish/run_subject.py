@@ -13,7 +13,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.data import View
-from gs2d.data.reach import Reach
+from gs2d.data.bounds import Reach
 from gs2d.data.subject_box import (
     OBJECT,
     Sight,

@@ -28,15 +28,14 @@ from gs2d.meshing.texture import (
     texture_size,
     unwrap,
 )
-from gs2d.pipeline.finish.run_mesh import fused, mesh_run
+from gs2d.pipeline.finish.run_mesh import check_mesh_options, fused, mesh_run
 from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.trusted_depth import usable_pixels
 from gs2d.pipeline.prepare.learned_views import as_scene
-from gs2d.pipeline.prepare.loaded import Trained, open_finished, spare_photographs
+from gs2d.pipeline.prepare.loaded import Trained, open_finished, read_resolved, spare_photographs
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
-from gs2d.pipeline.prepare.resolved import read_resolved
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
 PACKAGE = "xatlas"  # of the extra `texture`
@@ -58,6 +57,7 @@ def texture_run(
     replaces ``mesh.ply`` if ``out`` is None.
     """
     check_texture_options(options)
+    check_mesh_options(mesh_options)
     required(PACKAGE)  # before minutes are spent
     path = Path(path)
     target = path / TEXTURED if out is None else Path(out)

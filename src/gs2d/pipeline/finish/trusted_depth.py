@@ -9,12 +9,12 @@ import numpy as np
 from gs2d.core.camera import Camera
 from gs2d.core.transforms import up_direction
 from gs2d.data import Scene, View
-from gs2d.data.reach import Reach, reach_of
+from gs2d.data.bounds import Reach, reach_of
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.sky import sky_pixels
 from gs2d.pipeline.prepare.loaded import Trained
 
-BEYOND = 1.25  # times the reach of a scene (``data/reach.py``); depth beyond it is ignored
+BEYOND = 1.25  # times the reach of a scene (``data/bounds.py``); depth beyond it is ignored
 MIN_POINTS = 20  # sparse points in a photograph to search it for sky
 
 

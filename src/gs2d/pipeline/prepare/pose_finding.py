@@ -28,13 +28,11 @@ from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.prepare.limits import MAX_THREADS
 from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_choices, values
-from gs2d.sfm.as_fisheye import FISHEYE
 from gs2d.sfm.colmap_process import Group, Request, Solved, check_installed, layers, read_facts, solve
-from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.lens import START
+from gs2d.sfm.copies import copy_images, copy_masks, masks_of
+from gs2d.sfm.fisheye import FISHEYE
+from gs2d.sfm.lens import PANORAMA, START
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
-from gs2d.sfm.panoramas import PANORAMA
-from gs2d.sfm.photo_masks import copy_masks, masks_of
 from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, in_order_taken, panorama_groups, read_photos
 from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of

@@ -29,9 +29,8 @@ from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
 from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
-from gs2d.pipeline.prepare.loaded import LoadedRun, Trained, prepare_run
+from gs2d.pipeline.prepare.loaded import LoadedRun, Trained, check_same_run, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
-from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead
 from gs2d.pipeline.train.resume import choose_start

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from gs2d.data.reach import reach_of
+from gs2d.data.bounds import reach_of
 from gs2d.data.scene import Scene
 from gs2d.training.start.plane_sweep import Sweep, project, unproject
 
