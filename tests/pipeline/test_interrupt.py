@@ -14,7 +14,7 @@ import pytest
 from ball_runs import comparable, options
 from gs2d.errors import DiskError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.train.interruption import SAME, HeldSignals
+from gs2d.pipeline.train.run_logger import SAME, HeldSignals
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice
 from gs2d.training.trainer import Trainer

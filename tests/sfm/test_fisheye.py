@@ -13,7 +13,7 @@ from benchmarks.wide_captures import errors, write_photographs
 from gs2d.core.camera import look_at
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
-from gs2d.sfm.fisheye import fisheye_focal
+from gs2d.sfm.lens import fisheye_focal
 
 SIZE = (400, 300)
 F = 150.0

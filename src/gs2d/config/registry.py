@@ -45,18 +45,8 @@ class Registry(Generic[T]):
     """Objects by name: those of gs2d, of programs and of installed packages.
 
     Nothing is imported before it is used. If a package cannot be imported, only the use of its objects fails, with a
-    one-line error.
-
-    Parameters
-    ----------
-    what : str
-        Kind of the objects: "loss".
-    group : str
-        Group of entry points: "gs2d.losses".
-    builtin : mapping of name to module
-        Objects of gs2d, and the modules that register them when they are imported.
-    error : type of Gs2dError
-        Error for a wrong name.
+    one-line error. ``what``: kind of the objects: "loss". ``group``: group of entry points: "gs2d.losses". ``builtin``:
+    objects of gs2d, and the modules that register them when they are imported. ``error``: error for a wrong name.
     """
 
     def __init__(
@@ -79,12 +69,8 @@ class Registry(Generic[T]):
     def register(self, name: str, *, module: str | None = None) -> Callable[[Register], Register]:
         """Return a decorator that registers an object under a name.
 
-        ``module`` is the module that defines the object, if its ``__module__`` is another one.
-
-        Raises
-        ------
-        Gs2dError
-            From the decorator: the name is taken.
+        ``module`` is the module that defines the object, if its ``__module__`` is another one. The decorator raises
+        Gs2dError if the name is taken.
         """
 
         def registered(thing: Register) -> Register:
@@ -105,10 +91,7 @@ class Registry(Generic[T]):
     def get(self, name: str) -> T:
         """Return the object of a name, and import it if necessary.
 
-        Raises
-        ------
-        Gs2dError
-            If the name is unknown, or its package cannot be imported.
+        Raises Gs2dError if the name is unknown, or its package cannot be imported.
         """
         if name in self._homes and name not in self._things:
             import_module(self._homes[name])
@@ -129,12 +112,8 @@ class Registry(Generic[T]):
     def check(self, name: object) -> None:
         """Raise for an unknown name, unless :func:`absent_guests` allows it.
 
-        Nothing is imported. A program must register its names before it builds a recipe with them.
-
-        Raises
-        ------
-        Gs2dError
-            Lists the names and suggests the nearest one.
+        Nothing is imported. A program must register its names before it builds a recipe with them. The Gs2dError
+        lists the names and suggests the nearest one.
         """
         if name not in self and not _ABSENT.get():
             text = self.unknown(str(name))

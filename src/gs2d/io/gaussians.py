@@ -28,27 +28,14 @@ _FLAT = 0.99  # fraction of the Gaussians that must be disks
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """Attributes of N Gaussians before activation, float32.
+    """Attributes of N Gaussians before activation, float32."""
 
-    Attributes
-    ----------
-    means : ndarray [N, 3] world units
-    quats : ndarray [N, 4]
-        (w, x, y, z).
-    log_scales : ndarray [N, 3]
-        Logarithms of the standard deviations along the columns of the rotation.
-    opacity_logits : ndarray [N]
-    sh0 : ndarray [N, 3]
-    shN : ndarray [N, K-1, 3]
-        Higher SH coefficients, by degree, then order.
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    log_scales: np.ndarray
-    opacity_logits: np.ndarray
-    sh0: np.ndarray
-    shN: np.ndarray
+    means: np.ndarray  # [N, 3] world units
+    quats: np.ndarray  # [N, 4]; (w, x, y, z)
+    log_scales: np.ndarray  # [N, 3]; logarithms of the standard deviations along the columns of the rotation
+    opacity_logits: np.ndarray  # [N]
+    sh0: np.ndarray  # [N, 3]
+    shN: np.ndarray  # [N, K-1, 3]; higher SH coefficients, by degree, then order
 
     def __len__(self) -> int:
         return len(self.means)
@@ -80,10 +67,7 @@ class Gaussians:
     def placed(self, matrix: np.ndarray) -> Gaussians:
         """Apply a similarity transform [4, 4]: rotation, translation, uniform scale.
 
-        Raises
-        ------
-        ValueError
-            If it is no similarity.
+        Raises ValueError if it is no similarity.
         """
         linear = matrix[:3, :3]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -131,10 +115,7 @@ class Gaussians:
     def to_surfels(self, path: str | os.PathLike[str]) -> Splats:
         """Convert to disks; ``path`` is the file, for the error.
 
-        Raises
-        ------
-        DataError
-            If they are not flat.
+        Raises DataError if they are not flat.
         """
         if not self.is_flat:
             raise DataError(

@@ -361,17 +361,11 @@ def _write_obj(path: Path, mesh: TexturedMesh) -> None:
         texture.write(_png_bytes(mesh.texture))
         material.write(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {png.name}\n")
         file.write(f"mtllib {mtl.name}\nusemtl texture\n")
-        _lines(file, "v %.9g %.9g %.9g\n", positions)
-        _lines(file, "vt %.7g %.7g\n", np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1))  # origin at lower left
-        _lines(file, "vn %.5g %.5g %.5g\n", mesh.normals)
-        _lines(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([vertex, corner, corner], axis=2).reshape(-1, 9))
+        np.savetxt(file, positions, "v %.9g %.9g %.9g")
+        np.savetxt(file, np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1), "vt %.7g %.7g")  # origin at lower left
+        np.savetxt(file, mesh.normals, "vn %.5g %.5g %.5g")
+        np.savetxt(file, np.stack([vertex, corner, corner], axis=2).reshape(-1, 9), "f" + " %d/%d/%d" * 3)
         file.flush()  # a full disk must raise before any of the three files is renamed
-
-
-def _lines(file: Any, template: str, rows: np.ndarray, chunk: int = 10_000) -> None:
-    for start in range(0, len(rows), chunk):
-        part = rows[start : start + chunk]
-        file.write((template * len(part)) % tuple(part.reshape(-1).tolist()))
 
 
 def _png_bytes(image: np.ndarray) -> bytes:

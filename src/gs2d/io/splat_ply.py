@@ -38,19 +38,9 @@ def splat_fields(n_rest: int, *, layout: str) -> list[str]:
 def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str = "2dgs") -> None:
     """Write splats as float32, atomically.
 
-    Parameters
-    ----------
-    path : path
-    splats : Splats
-        On any device; float32 values are stored exactly (``layout="2dgs"``).
-    layout : "2dgs" or "3dgs"
-        The official 2DGS layout, or the one for common viewers (with ``scale_2``, the thickness, after ``scale_1``, and
-        a comment that the splats are disks).
-
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
+    ``splats``: on any device; float32 values are stored exactly (``layout="2dgs"``). ``layout`` ("2dgs" or "3dgs"): the
+    official 2DGS layout, or the one for common viewers (with ``scale_2``, the thickness, after ``scale_1``, and a
+    comment that the splats are disks). Raises DiskError if the file could not be written.
     """
     n, n_rest = len(splats), 3 * splats.shN.shape[1]
     columns = {name: tensor.detach().to("cpu", torch.float32).numpy() for name, tensor in splats.items()}
@@ -74,18 +64,9 @@ def _fill(rows: np.ndarray, names: list[str] | tuple[str, ...], columns: np.ndar
 def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Splats:
     """Read splats in the official 2DGS layout, float32 on the CPU; extra properties are ignored.
 
-    Half floats stored as ``ushort`` are decoded. Colours ``red green blue`` may replace ``f_dc_*``.
-
-    Parameters
-    ----------
-    path : path
-    tell : callable
-        Receives a message if SH bands above degree 3 are dropped.
-
-    Raises
-    ------
-    DataError
-        If the file is broken, no PLY, or of another kind: 3DGS (three scales), compressed, a mesh, points.
+    Half floats stored as ``ushort`` are decoded. Colours ``red green blue`` may replace ``f_dc_*``. ``tell``: receives
+    a message if SH bands above degree 3 are dropped. Raises DataError if the file is broken, no PLY, or of another
+    kind: 3DGS (three scales), compressed, a mesh, points.
     """
     vertex = _splat_element(path, read_ply(path))
     return Splats(**_attributes(path, vertex, ("scale_0", "scale_1"), tell))

@@ -21,8 +21,7 @@ import numpy as np
 
 from gs2d.core.similarity import rotation_to_z
 from gs2d.sfm.compare import find_features, match
-from gs2d.sfm.fisheye import settle_fisheyes
-from gs2d.sfm.lens import PANORAMA, RICH, START, with_rich_lenses
+from gs2d.sfm.lens import PANORAMA, RICH, START, settle_fisheyes, with_rich_lenses
 from gs2d.sfm.mapping import Steps, extend, map_globally, map_incrementally
 from gs2d.sfm.search import FISHEYES, MAPPING
 

@@ -30,8 +30,7 @@ from gs2d.pipeline.prepare.limits import MAX_THREADS
 from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_choices, values
 from gs2d.sfm.colmap_process import Group, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.copies import copy_images, copy_masks, masks_of
-from gs2d.sfm.fisheye import FISHEYE
-from gs2d.sfm.lens import PANORAMA, START
+from gs2d.sfm.lens import FISHEYE, PANORAMA, START
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
 from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, in_order_taken, panorama_groups, read_photos
 from gs2d.sfm.plot import write_image_of

@@ -22,8 +22,7 @@ from gs2d.errors import BackendError, Gs2dError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.train.interruption import HeldSignals
-from gs2d.pipeline.train.run_logger import progress_every
+from gs2d.pipeline.train.run_logger import HeldSignals, progress_every
 from gs2d.training.events import Notice, OnEvent, ignore
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
 from gs2d.training.trainer import Trainer, TrainerOptions
