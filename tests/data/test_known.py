@@ -16,6 +16,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import View, load_scene
 from gs2d.data.undistort import colmap_intrinsics, source_positions
 from gs2d.pipeline.finish import run_mesh as surface
+from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
@@ -98,13 +99,10 @@ def test_the_depth_of_invalid_pixels_is_not_fused(use_masks: bool) -> None:
         sh0=torch.zeros(1, 1, 3),
         shN=torch.zeros(1, 0, 3),
     )
-    job: Any = SimpleNamespace(
-        scene=SimpleNamespace(train=(view,)),
-        settings=RasterSettings(sh_degree=0),
-        backend=get_backend("reference"),
-        protocol=SimpleNamespace(use_mask_in_fusion=use_masks, fusion=SimpleNamespace(subject=False)),
-    )
-    frame = next(iter(surface._frames(job, splat, MeshOptions(depth="median", whole_scene=True), ignore)))
+    scene: Any = SimpleNamespace(train=(view,))
+    protocol: Any = SimpleNamespace(use_mask_in_fusion=use_masks, fusion=SimpleNamespace(subject=False))
+    trained = Trained(splat, scene, protocol, RasterSettings(sh_degree=0), get_backend("reference"))
+    frame = next(iter(surface._frames(trained, MeshOptions(depth="median", whole_scene=True), ignore)))
     assert frame.valid is not None
     assert frame.valid[:, 4:].any()
     assert not frame.valid[:, :4].any()

@@ -6,6 +6,7 @@ import importlib.metadata
 import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from gs2d.cli import run
 from gs2d.data.readers.colmap import ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.sfm.colmap_process import Group, MatchFacts, Request, Solved, check_installed, solve
+from gs2d.sfm.colmap_process import MatchFacts, Request, check_installed, solve
 from gs2d.sfm.model import SfmModel, why_not_placed
 from gs2d.sfm.workspace import check_out, put_in_place, workspace
 
@@ -52,13 +53,10 @@ def test_the_reason_for_an_unplaced_photograph(name: str, expected: str) -> None
 
 # -- the worker --------------------------------------------------------------------------------------------------------
 def request(work: Path) -> Request:
-    group = Group(("a.jpg",), "OPENCV", (9, 9), "a.jpg")
-    database, output = str(work / "database.db"), str(work / "out")
-    chosen = ("name", (None,), "exhaustive", 1, 1, "incremental")
-    return Request("images", database, output, (group,), ("a.jpg",), *chosen, 64, 1, 0)
+    return {"database": str(work / "database.db"), "groups": [{"camera_model": "OPENCV"}]}
 
 
-def follow(work: Path, code: str) -> tuple[list[object], Solved]:
+def follow(work: Path, code: str) -> tuple[list[object], dict[str, Any]]:
     """Run a worker with this Python code, in which ``say(...)`` sends a message."""
     program = "import json, os, sys\ndef say(**m): print(json.dumps(m), flush=True)\n" + code
     steps: list[object] = []
@@ -73,7 +71,7 @@ def test_messages_of_the_worker_become_progress(tmp_path: Path) -> None:
     )
     steps, solved = follow(tmp_path, code)
     assert steps == [("placing cameras", 0, 5), ("placing cameras", 2, 5), ("placing cameras", 5, 5)]
-    assert solved == Solved([{"upright": True}], {})
+    assert solved["models"] == [{"upright": True}]
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,6 +24,7 @@ from gs2d.sfm.search import count, read_only
 
 OnProgress = Callable[[str, int, int], None]  # name of the phase, finished steps, total steps
 OnNote = Callable[[str], None]  # a message to show
+Request = Mapping[str, Any]  # input of the worker, from ``pose_finding``; the worker reads it as JSON
 MISSING = f"structure from motion needs pycolmap, which is not installed: {install('sfm')}"
 POLL_SECONDS = 0.5
 _LITTLE_SPACE = 64 << 20  # bytes; SQLite frees what it could not finish writing when it gives up
@@ -42,51 +43,14 @@ _PHASES = {
 }
 
 
-@dataclass(frozen=True)
-class Group:
-    """Images of one camera."""
-
-    names: tuple[str, ...]
-    camera_model: str  # COLMAP camera model
-    size: tuple[int, int]  # width and height, px
-    original: str  # an image file with EXIF
-
-
-@dataclass(frozen=True)
-class Request:
-    """Input of the worker. Every path is absolute."""
-
-    images: str  # folder of the images
-    # database, output: COLMAP database, and the folder for the models ``0``, ``1`` ...
-    database: str
-    output: str
-    groups: tuple[Group, ...]
-    in_order: tuple[str, ...]  # all image names, in the order in which they were taken
-    ordered_by: str  # "time" or "name"; source of that order
-    # Position of each name in ``in_order``, metres; None if unknown.
-    places: tuple[tuple[float, float, float] | None, ...]
-    matching: str  # "exhaustive", "sequential", "similar" or "spatial"
-    # overlap, neighbours: number of consecutive and of similar images that each image is matched with, unless all pairs
-    # are matched
-    overlap: int
-    neighbours: int
-    mapper: str  # "incremental" or "global"
-    feature_size: int  # longer side for feature detection, px
-    threads: int
-    seed: int
-    asked_lens: str | None = None  # requested camera model; None: by the number of images (``lens``)
-    masks: str | None = None  # folder of masks (``NAME.png``): black pixels give no features
-
-
 def layers(request: Request) -> dict[str, Any]:
     """Return the inputs of features, pairs and mapping, for :func:`gs2d.sfm.search.go_on`."""
-    inputs = asdict(request)
     pairs = ("in_order", "ordered_by", "places", "matching", "overlap", "neighbours")
-    features = ("groups", "feature_size", "seed", *(("masks",) if request.masks is not None else ()))
+    features = ("groups", "feature_size", "seed", *(("masks",) if request["masks"] is not None else ()))
     return {
-        "features": {name: inputs[name] for name in features},
-        "pairs": {name: inputs[name] for name in pairs},
-        "mapping": {name: inputs[name] for name in ("asked_lens", "mapper")},
+        "features": {name: request[name] for name in features},
+        "pairs": {name: request[name] for name in pairs},
+        "mapping": {name: request[name] for name in ("asked_lens", "mapper")},
     }
 
 
@@ -96,26 +60,17 @@ def check_installed() -> None:
         raise BackendError(MISSING)
 
 
-@dataclass(frozen=True)
-class Solved:
-    """Result of the worker."""
-
-    # Facts of each model that was written, largest first; empty if nothing could be placed.
-    models: list[dict[str, Any]]
-    lens: dict[str, Any]  # the lens, ``chosen`` and ``asked``; empty without a model
-
-
 def solve(
     request: Request, on_progress: OnProgress, on_note: OnNote = lambda _line: None, *, command: Sequence[str] = ()
-) -> Solved:
-    """Estimate the cameras.
+) -> dict[str, Any]:
+    """Estimate the cameras; return what ``colmap_worker.map_`` does.
 
     ``command``: command line of the worker, without the request (default: ``colmap_worker``). Raises DataError if the
     worker failed or crashed; with the phase and its last line.
     """
-    work = Path(request.database).parent
+    work = Path(request["database"]).parent
     with atomic_write(work / "request.json", "w") as file:
-        json.dump(asdict(request), file)
+        json.dump(request, file)
     words = [*(command or (sys.executable, "-c", _WORKER)), str(work / "request.json"), *sys.path]
     # Cores are often shared: with active waiting, idle threads of one library block those of another.
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
@@ -124,7 +79,7 @@ def solve(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=environment, encoding="utf-8"
         )
         try:
-            solved, phase = _follow(process, Path(request.database), on_progress, on_note)
+            solved, phase = _follow(process, Path(request["database"]), on_progress, on_note)
         finally:
             process.kill()
             process.wait()
@@ -138,7 +93,7 @@ def solve(
 
 def _follow(
     process: subprocess.Popen[str], database: Path, on_progress: OnProgress, on_note: OnNote
-) -> tuple[Solved | None, str]:
+) -> tuple[dict[str, Any] | None, str]:
     """Report progress until the worker ends; returns its result, if any, and its last phase."""
     lines: queue.Queue[str | None] = queue.Queue()
     assert process.stdout is not None
@@ -160,7 +115,7 @@ def _follow(
             return solved, phase
         message = json.loads(line)
         if "models" in message:
-            solved = Solved(message["models"], message.get("lens", {}))
+            solved = message
         if "note" in message:
             on_note(message["note"])
         if "phase" in message:

@@ -10,7 +10,6 @@ import itertools
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -100,17 +99,18 @@ def match(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
         pairing = pycolmap.ExhaustivePairingOptions()
         pycolmap.match_exhaustive(database, matching, pairing, verification, cpu)
         return
-    pairs = _pairs(pycolmap, request, say)
-    say(phase="matching", total=len(pairs), note=pairs.line(len(names)))
+    reasons = _pairs(pycolmap, request, say)
+    pairs = sorted(set().union(*reasons.values()))
+    say(phase="matching", total=len(pairs), note=pairs_line(reasons, len(pairs), len(names)))
     listed = Path(database).with_name("pairs.txt")
-    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.pairs), encoding="utf-8")
+    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), encoding="utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)
     pycolmap.match_image_pairs(database, matching, pairing, verification, cpu)
 
 
-def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> Chosen:
-    """Choose the pairs to match if not all are matched: consecutive, spatially near, and similar images."""
+def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> dict[str, set[tuple[int, int]]]:
+    """Return the pairs (i < j) to match by reason: consecutive, spatially near, and similar images."""
     matching, count = request["matching"], len(request["in_order"])
     next_to = f"next to each other by {request['ordered_by']}"
     following = neighbour_pairs(count, request["overlap"])
@@ -123,7 +123,7 @@ def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> Chosen:
     if matching != "sequential":
         say(phase="comparing", total=2 * count)
         reasons["similar"] = _similar(pycolmap, request, say)
-    return chosen(reasons)
+    return reasons
 
 
 def _alike(request: dict[str, Any]) -> list[int]:
@@ -162,27 +162,11 @@ _ROUNDS = 10  # of k-means
 _SAMPLES = 30_000  # descriptors for k-means
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """Pairs to match, with the reasons."""
-
-    pairs: tuple[tuple[int, int], ...]  # i < j, ascending
-    reasons: Mapping[str, int]  # number of pairs for each reason; a pair may have several
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def line(self, count: int) -> str:
-        """Summarize how many of all pairs of ``count`` images are matched, and why."""
-        why = ", ".join(f"{number:,} {reason}" for reason, number in self.reasons.items())
-        both = " (some for two reasons)" if sum(self.reasons.values()) > len(self.pairs) else ""
-        return f"{len(self.pairs):,} of {count * (count - 1) // 2:,} pairs of photographs are matched: {why}{both}"
-
-
-def chosen(reasons: Mapping[str, set[tuple[int, int]]]) -> Chosen:
-    """Return the union of sets of pairs, by reason."""
-    pairs = sorted(set().union(*reasons.values()))
-    return Chosen(tuple(pairs), {reason: len(some) for reason, some in reasons.items() if some})
+def pairs_line(reasons: Mapping[str, set[tuple[int, int]]], pairs: int, count: int) -> str:
+    """Summarize how many of all pairs of ``count`` images are matched, and why; a pair may have several reasons."""
+    why = ", ".join(f"{len(some):,} {reason}" for reason, some in reasons.items() if some)
+    both = " (some for two reasons)" if sum(map(len, reasons.values())) > pairs else ""
+    return f"{pairs:,} of {count * (count - 1) // 2:,} pairs of photographs are matched: {why}{both}"
 
 
 def neighbour_pairs(count: int, overlap: int) -> set[tuple[int, int]]:

@@ -10,8 +10,7 @@ import importlib.metadata
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.prepare.limits import MAX_THREADS
 from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_choices, values
-from gs2d.sfm.colmap_process import Group, Request, Solved, check_installed, layers, read_facts, solve
+from gs2d.sfm.colmap_process import Request, check_installed, layers, read_facts, solve
 from gs2d.sfm.copies import copy_images, copy_masks, masks_of
 from gs2d.sfm.lens import FISHEYE, PANORAMA, START
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
@@ -96,10 +95,9 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             photos = list(counted(reading, "reading photographs", len(paths), on_event))
             masks = _masks_of(options, photos, video is not None, on_event)
             source |= {"masks": [_stamp(mask) for mask in masks if mask is not None]} if any(masks) else {}
-            request = _request(options, work, photos, threads, on_event)
             capture = work / STAGED
-            if any(masks) and not options.match_masked:
-                request = replace(request, masks=str(capture / FOLDER))
+            used = str(capture / FOLDER) if any(masks) and not options.match_masked else None
+            request = _request(options, work, photos, used, threads, on_event)
             if line := go_on(work, {"photographs": source, **layers(request)}, ours=(STAGED,)):
                 on_event(Notice(line))
             masked = copy_masks(photos, masks, capture / FOLDER, options.max_size)
@@ -234,7 +232,9 @@ def _stage(
 
 
 # -- the request to COLMAP ---------------------------------------------------------------------------------------------
-def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads: int, on_event: OnEvent) -> Request:
+def _request(
+    options: PosesOptions, work: Path, photos: Sequence[Photo], masks: str | None, threads: int, on_event: OnEvent
+) -> Request:
     """Return the request to COLMAP."""
     positions, note = metric_positions(photos, options.positions)
     if note:
@@ -248,31 +248,29 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
     lens = START if options.camera_model in ("auto", FISHEYE) else options.camera_model
     order, ordered_by = in_order_taken(photos)
     known = sum(position is not None for position in positions)
-    return Request(
-        images=str(work / STAGED / IMAGES),
-        database=str(work / DATABASE),
-        output=str(work / STAGED / SPARSE),
-        groups=tuple(
-            Group(
-                tuple(photos[i].name for i in group),
-                PANORAMA if is_panorama else lens,
-                sizes[group[0]],
-                str(photos[group[0]].source.resolve()),
-            )
+    return {  # every path is absolute
+        "images": str(work / STAGED / IMAGES),
+        "database": str(work / DATABASE),
+        "output": str(work / STAGED / SPARSE),  # folder for the models ``0``, ``1`` ...
+        "groups": [  # photographs of one camera
+            {
+                "names": [photos[i].name for i in group],
+                "camera_model": PANORAMA if is_panorama else lens,
+                "size": sizes[group[0]],  # width and height, px
+                "original": str(photos[group[0]].source.resolve()),  # with EXIF
+            }
             for group, is_panorama in zip(groups, panoramas, strict=True)
-        ),
-        in_order=tuple(photos[i].name for i in order),
-        ordered_by=ordered_by,
-        places=tuple(positions[i] for i in order),
-        matching=_matching(options.matching, len(photos), known),
-        mapper=options.mapper if options.mapper != "auto" else "global" if len(photos) >= MANY else "incremental",
-        overlap=options.overlap,
-        neighbours=options.neighbours,
-        feature_size=options.feature_size,
-        threads=threads,
-        seed=options.seed,
-        asked_lens=None if options.camera_model == "auto" else options.camera_model,
-    )
+        ],
+        "in_order": [photos[i].name for i in order],  # in which they were taken
+        "ordered_by": ordered_by,  # "time" or "name"
+        "places": [positions[i] for i in order],  # metres; None: unknown
+        "matching": _matching(options.matching, len(photos), known),
+        "mapper": options.mapper if options.mapper != "auto" else "global" if len(photos) >= MANY else "incremental",
+        **{name: getattr(options, name) for name in ("overlap", "neighbours", "feature_size", "seed")},
+        "threads": threads,
+        "asked_lens": None if options.camera_model == "auto" else options.camera_model,  # None: by number (`lens`)
+        "masks": masks,  # folder of masks (``NAME.png``): black pixels give no features
+    }
 
 
 def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list[Position | None], str]:
@@ -340,14 +338,14 @@ def _progress(on_event: OnEvent) -> Callable[[str, int, int], None]:
 
 # -- the result --------------------------------------------------------------------------------------------------------
 def _read_models(
-    options: PosesOptions, request: Request, photos: Sequence[Photo], staged: Sequence[str], solved: Solved
+    options: PosesOptions, request: Request, photos: Sequence[Photo], staged: Sequence[str], solved: Mapping[str, Any]
 ) -> tuple[list[SfmModel], dict[str, Any]]:
     """Return the models that COLMAP found, largest first, and the contents of ``poses.json``.
 
     Raises DataError if no photograph was placed.
     """
-    models = [read_model(Path(request.output) / str(i), done) for i, done in enumerate(solved.models)]
-    facts = read_facts(Path(request.database))
+    models = [read_model(Path(request["output"]) / str(i), done) for i, done in enumerate(solved["models"])]
+    facts = read_facts(Path(request["database"]))
     check_any(models, facts, options.photos)
     best = models[0]
     per_camera = Counter(image.camera_id for image in best.images)
@@ -377,7 +375,7 @@ def _read_models(
             }
             for camera, count in ((best.cameras[number], count) for number, count in sorted(per_camera.items()))
         ],
-        "lens": solved.lens,
+        "lens": solved["lens"],
         "other_models": [
             {"folder": f"{SPARSE}/{i}", "photos": sorted(model.names), "points": len(model.points.xyz)}
             for i, model in enumerate(models[1:], start=1)
@@ -385,10 +383,10 @@ def _read_models(
         "photographs": rows,
         "requested": requested_options(options),
         "options": {
-            "matching": request.matching,
-            "mapper": request.mapper,
+            "matching": request["matching"],
+            "mapper": request["mapper"],
             "pairs_matched": len(facts.matches),
-            "threads": request.threads,
+            "threads": request["threads"],
         },
         "created": now(),
     }
