@@ -74,37 +74,21 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A capture as its reader returns it; further attributes are as in Scene.
-
-    Attributes
-    ----------
-    downscaled_by : int
-        Factor by which the image files are already downscaled (``images_N``).
-    home : Path or None
-        Folder that may hold folders of maps and masks, if it is not the root.
-    observe : callable or None
-        Reads which sparse points each image observes.
-    mask_homes : tuple of Path
-        Further folders that may hold masks.
-    finds_masks : bool
-        False if files with the usual names of masks are something else.
-    is_synthetic : bool
-        Try the box [-1.3, 1.3]^3 of NeRF-Synthetic; it is used if the cameras agree with it.
-    """
+    """A capture as its reader returns it; further attributes are as in Scene."""
 
     format: str
     frames: tuple[PosedImage, ...]
     points: PointCloud | None = None
     T_metric_scene: np.ndarray = field(default_factory=lambda: np.eye(4))
     default_test_every: int = 8
-    downscaled_by: int = 1
+    downscaled_by: int = 1  # factor by which the image files are already downscaled (``images_N``)
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    home: Path | None = None
-    observe: Callable[[], ObservedPoints] | None = None
-    mask_homes: tuple[Path, ...] = ()
-    finds_masks: bool = True
-    is_synthetic: bool = False
+    home: Path | None = None  # folder that may hold folders of maps and masks, if it is not the root
+    observe: Callable[[], ObservedPoints] | None = None  # reads which sparse points each image observes
+    mask_homes: tuple[Path, ...] = ()  # further folders that may hold masks
+    finds_masks: bool = True  # False if files with the usual names of masks are something else
+    is_synthetic: bool = False  # try the box [-1.3, 1.3]^3 of NeRF-Synthetic; it is used if the cameras agree with it
 
 
 def decode(frame: PosedImage, downscale: int) -> DecodedImage:

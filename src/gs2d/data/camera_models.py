@@ -37,30 +37,14 @@ _SMALLEST = 1e-12  # radius, so that nothing is divided by 0
 
 @dataclass(frozen=True)
 class Lens:
-    """The parameters of a camera model besides focal lengths and principal point.
+    """The parameters of a camera model besides focal lengths and principal point."""
 
-    Attributes
-    ----------
-    kind : str
-        Name of the camera model: "perspective", "fisheye", "fov", "equirectangular" or a registered one.
-    radial : tuple of float
-        n1, n2, ... ("fov": the angle w). A registered model has its own parameters here.
-    divisor : tuple of float
-        d1, d2, ... ("perspective").
-    tangential : tuple of 2 floats
-        p1, p2 ("perspective" and "fisheye").
-    skew : float
-        Shear of the sensor, in units of fx.
-    prism : tuple of 2 floats
-        s1, s2 ("fisheye").
-    """
-
-    kind: str
-    radial: tuple[float, ...] = ()
-    divisor: tuple[float, ...] = ()
-    tangential: tuple[float, float] = (0.0, 0.0)
-    skew: float = 0.0
-    prism: tuple[float, float] = (0.0, 0.0)
+    kind: str  # name of the camera model: "perspective", "fisheye", "fov", "equirectangular" or a registered one
+    radial: tuple[float, ...] = ()  # n1, n2, ... ("fov": the angle w). A registered model has its own parameters here.
+    divisor: tuple[float, ...] = ()  # d1, d2, ... ("perspective").
+    tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2 ("perspective" and "fisheye")
+    skew: float = 0.0  # shear of the sensor, in units of fx
+    prism: tuple[float, float] = (0.0, 0.0)  # s1, s2 ("fisheye")
 
     @property
     def is_identity(self) -> bool:

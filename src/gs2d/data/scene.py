@@ -27,42 +27,20 @@ Appearance = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class View:
-    """An image with its camera, decoded on demand.
+    """An image with its camera, decoded on demand."""
 
-    Attributes
-    ----------
-    name : str
-        Unique in its scene: file path relative to the image folder, with ``/`` (``cam0/0001.jpg``).
-    camera : Camera
-        Pinhole camera of ``image()``, after undistortion and downscaling.
-    decode : callable
-        Decodes the image from disk; called through the cache.
-    cache : ImageCache
-        Shared by all views of a scene.
-    path : Path or None
-        Image file.
-    maps : PriorMaps or None
-        Depth and normal maps.
-    intrinsics : Intrinsics or None
-        Intrinsics of the image file, before undistortion and downscaling; None: as ``camera``.
-    zoom : Zoom or None
-        Learned change of the intrinsics of ``camera``; None: unchanged.
-    appearance : mapping of name to ndarray
-        Learned parameters of how the image shows the colours of the scene (``gs2d.training.learned``).
-    is_face : bool
-        Whether it was cut out of a panorama or a wide fisheye (``data/faces.py``).
-    """
-
-    name: str
-    camera: Camera
-    decode: Callable[[], DecodedImage] = field(repr=False)
-    cache: ImageCache = field(repr=False, default_factory=lambda: ImageCache(0))
-    path: Path | None = None
-    maps: PriorMaps | None = None
+    name: str  # unique in its scene: file path relative to the image folder, with ``/`` (``cam0/0001.jpg``)
+    camera: Camera  # pinhole camera of ``image()``, after undistortion and downscaling
+    decode: Callable[[], DecodedImage] = field(repr=False)  # decodes the image from disk; called through the cache
+    cache: ImageCache = field(repr=False, default_factory=lambda: ImageCache(0))  # shared by all views of a scene
+    path: Path | None = None  # image file
+    maps: PriorMaps | None = None  # depth and normal maps
+    # Intrinsics of the image file, before undistortion and downscaling; None: as ``camera``.
     intrinsics: Intrinsics | None = None
-    zoom: Zoom | None = None
+    zoom: Zoom | None = None  # learned change of the intrinsics of ``camera``; None: unchanged
+    # Learned parameters of how the image shows the colours of the scene (``gs2d.training.learned``).
     appearance: Appearance = field(default_factory=dict)
-    is_face: bool = False
+    is_face: bool = False  # whether it was cut out of a panorama or a wide fisheye (``data/faces.py``)
 
     @classmethod
     def from_arrays(
