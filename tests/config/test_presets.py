@@ -10,6 +10,7 @@ from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
 from gs2d.config.presets import (
     DEPTH_WEIGHT,
     RECIPES,
+    about_recipe,
     get_recipe,
     with_depth_prior,
     with_normal_prior,
@@ -28,7 +29,7 @@ def test_every_named_recipe_is_valid_and_carries_its_name(name: str) -> None:
     recipe = get_recipe(name)
     assert validate(recipe) is recipe
     assert recipe.name == name
-    assert RECIPES[name].about
+    assert about_recipe(name)
 
 
 def test_2dgs_is_the_official_recipe() -> None:

@@ -22,8 +22,7 @@ from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish.run_subject import sights
 from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
-from gs2d.pipeline.prepare.digest import scene_digest
-from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.pipeline.prepare.loaded import reload_run, scene_digest
 from gs2d.pipeline.prepare.open_capture import without_masked_points
 from gs2d.pipeline.prepare.options import MeshOptions, Training
 from gs2d.render.backends import get_backend

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -290,37 +290,26 @@ def with_intrinsics(recipe: Recipe) -> Recipe:
     return replace(refined, name=f"{recipe.name.removesuffix('-poses')}-cameras")
 
 
-@dataclass(frozen=True)
-class NamedRecipe:
-    """An entry of the registry; calling it builds the recipe."""
-
-    about: str
-    build: Callable[..., Recipe]
-
-    def __call__(self) -> Recipe:
-        """Build the recipe."""
-        return self.build()
+RECIPES: Registry[Any] = Registry(
+    "recipe",
+    "gs2d.recipes",
+    builtin=dict.fromkeys(("best", "best-fast", "2dgs", "2dgs-r"), __name__),
+    error=RecipeError,
+)
+"""Names of recipes -> a Recipe, or a function without arguments that returns one."""
 
 
-def _registry() -> dict[str, NamedRecipe]:
-    """Every named recipe, in the order in which it is listed."""
-    entries: dict[str, NamedRecipe] = {}
-
-    def add(name: str, about: str, build: Callable[..., Recipe]) -> None:
-        entries[name] = NamedRecipe(about, partial(build, name=name))
-
-    add("best", "The default: 2DGS from a fitted dense start; best images and surface for the time", best)
-    add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
-    add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
-    add("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
-    return entries
+def add_recipe(name: str, about: str, build: Callable[..., Recipe], *, module: str = __name__) -> None:
+    """Register ``build(name=name)``; ``about`` is the line of ``gs2d recipes``."""
+    recipe = partial(build, name=name)
+    recipe.__doc__ = about
+    RECIPES.register(name, module=module)(recipe)
 
 
-_OWN = _registry()
-RECIPES: Registry[Any] = Registry("recipe", "gs2d.recipes", builtin=dict.fromkeys(_OWN, __name__), error=RecipeError)
-"""Names of recipes -> NamedRecipe, or for plug-ins a Recipe or a function without arguments that returns one."""
-for _name, _named in _OWN.items():
-    RECIPES.register(_name)(_named)
+add_recipe("best", "The default: 2DGS from a fitted dense start; best images and surface for the time", best)
+add_recipe("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
+add_recipe("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
+add_recipe("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
 
 
 def register_recipe(name: str) -> Callable[[Register], Register]:
@@ -356,10 +345,8 @@ def register_recipe(name: str) -> Callable[[Register], Register]:
 
 
 def about_recipe(name: str) -> str:
-    """Return one line about a recipe; for plug-ins the first line of the docstring, or the stages."""
+    """Return one line about a recipe: the first line of its docstring, or the stages."""
     found = get_recipe(name) if is_recipe_file(name) else RECIPES.get(name)
-    if isinstance(found, NamedRecipe):
-        return found.about
     if isinstance(found, Recipe):
         return ", ".join(f"{stage.name} ({stage.iterations:,})" for stage in found.stages)
     return (getattr(found, "__doc__", None) or "").strip().partition("\n")[0] or f"a recipe of {RECIPES.source(name)}"
@@ -388,8 +375,7 @@ def get_recipe(name: str) -> Recipe:
     if name not in RECIPES:
         near = did_you_mean(name, list(RECIPES))
         raise RecipeError(f"no recipe {name!r}; `gs2d recipes --all` lists them{near}")
-    found = RECIPES.get(name)
-    return found() if isinstance(found, NamedRecipe) else made_recipe(found, f"recipe {name!r}")
+    return made_recipe(RECIPES.get(name), f"recipe {name!r}")
 
 
 def list_recipes() -> tuple[str, ...]:

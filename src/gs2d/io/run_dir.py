@@ -290,11 +290,6 @@ def _object(path: Path) -> dict[str, Any]:
     return data
 
 
-def _is_unfinished(name: str) -> bool:
-    """Whether a file is an incomplete ``run.json`` of a killed process."""
-    return name.startswith(f".{RUN_JSON}.") and is_temporary(name)
-
-
 def is_run(path: Path) -> bool:
     """Whether a folder holds a run."""
     return (path / RUN_JSON).is_file()
@@ -333,8 +328,9 @@ def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tup
         if not (resume or overwrite):
             raise RunError(f"{path} already holds a run; continue it with --resume, replace it with --overwrite")
         return
-    names = (entry.name for entry in path.iterdir())
-    others = sorted(name for name in names if name not in (LOCK, *allowed) and not _is_unfinished(name))
+    names = {entry.name for entry in path.iterdir()} - {LOCK, *allowed}
+    unfinished = {name for name in names if name.startswith(f".{RUN_JSON}.") and is_temporary(name)}  # of a killed run
+    others = sorted(names - unfinished)
     if others:
         raise RunError(
             f"--out must be new, empty or a run; {path} holds other files ({others[0]}); choose another folder"

@@ -21,8 +21,7 @@ from gs2d.data import Scene
 from gs2d.data.arrays import read_npz
 from gs2d.errors import DataError, RunError
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.prepare.digest import scene_digest, with_priors
-from gs2d.pipeline.prepare.loaded import LoadedRun, loaded_run
+from gs2d.pipeline.prepare.loaded import LoadedRun, loaded_run, scene_digest, with_priors
 from gs2d.pipeline.prepare.open_capture import open_capture, without_masked_points
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.resolve import schedule_scale_of

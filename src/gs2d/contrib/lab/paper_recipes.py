@@ -12,8 +12,7 @@ from types import MappingProxyType
 
 from gs2d.config.presets import (
     PHOTOMETRIC,
-    RECIPES,
-    NamedRecipe,
+    add_recipe,
     appearance,
     rates_after_surface,
     refine,
@@ -56,7 +55,7 @@ def two_dgs_60k(*, name: str = "2dgs-60k") -> Recipe:
 
 def _register_rows() -> None:
     def add(name: str, about: str, build: Callable[..., Recipe]) -> None:
-        RECIPES.register(name, module=__name__)(NamedRecipe(about, partial(build, name=name)))
+        add_recipe(name, about, build, module=__name__)
 
     add("2dgs-no-nc", "2DGS without normal consistency", partial(two_dgs, nc=0.0))
     add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: its control", two_dgs_60k)

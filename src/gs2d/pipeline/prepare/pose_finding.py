@@ -30,9 +30,8 @@ from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_ch
 from gs2d.sfm.colmap_process import Request, check_installed, layers, read_facts, solve
 from gs2d.sfm.copies import copy_images, copy_masks, masks_of
 from gs2d.sfm.lens import FISHEYE, PANORAMA, START
-from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
+from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed, write_image_of
 from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, in_order_taken, panorama_groups, read_photos
-from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
 from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
 from gs2d.sfm.workspace import (
