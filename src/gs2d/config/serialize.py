@@ -88,13 +88,13 @@ def _set(data: dict[str, Any], words: list[str], value: Any, override: str) -> N
         if not words:
             raise RecipeError(f"override {override!r}: name a field of the stage: {', '.join(node)}")
     for depth, word in enumerate(words):
-        last = depth == len(words) - 1
+        last, above = depth == len(words) - 1, words[depth - 1] if depth else ""
         if isinstance(node, list) and not last:
             node = _entry(node, word, override)
-        elif isinstance(node, dict) and last and words[max(depth - 1, 0)] == "train" and depth > 0:
-            _set_trained(node, word, value)  # validate() checks the attributes
-        elif isinstance(node, dict) and last and words[max(depth - 1, 0)] == "options" and depth > 0:
-            node[word] = value  # the loss, densifier, action or quantity checks its options
+        elif isinstance(node, dict) and last and above == "train" and value is None:
+            node.pop(word, None)
+        elif isinstance(node, dict) and last and above in ("train", "options"):
+            node[word] = value  # validate() checks attributes; the loss, densifier, action or quantity its options
         elif isinstance(node, dict) and word in node:
             if last:
                 node[word] = value
@@ -104,13 +104,6 @@ def _set(data: dict[str, Any], words: list[str], value: Any, override: str) -> N
             known = ", ".join(node) if isinstance(node, dict) else "nothing below it (it is null or a plain value)"
             near = did_you_mean(word, list(node)) if isinstance(node, dict) else ""
             raise RecipeError(f"override {override!r}: no field {word!r}; there is {known}{near}")
-
-
-def _set_trained(train: dict[str, Any], attribute: str, rows: Any) -> None:
-    if rows is None:
-        train.pop(attribute, None)
-    else:
-        train[attribute] = rows
 
 
 def _entry(entries: list[Any], word: str, override: str) -> Any:
