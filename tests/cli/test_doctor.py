@@ -25,7 +25,7 @@ def test_doctor_checks_the_requirements_of_every_command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PATH", "")
-    monkeypatch.setattr("gs2d.cli.doctor._version", lambda name: None if name in ("xatlas", "pi-heif") else "1.2.3")
+    monkeypatch.setattr("gs2d.cli.handlers._version", lambda name: None if name in ("xatlas", "pi-heif") else "1.2.3")
     assert run(["doctor", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     missing = {name for name, entry in report["optional"].items() if not entry["available"]}

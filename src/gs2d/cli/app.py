@@ -19,7 +19,7 @@ from dataclasses import replace
 from typing import NoReturn
 
 import gs2d
-from gs2d.cli.command_line import NAMES
+from gs2d.cli.command_line import NAMES, command_help, program_help
 from gs2d.cli.commands import COMMANDS, Common, DoctorCommand, InfoCommand, RecipesCommand, TrainCommand
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
@@ -116,11 +116,9 @@ def _drop_stdout() -> None:
 
 def _help_or_version(argv: Sequence[str]) -> list[str] | None:
     """Return the lines of help or version, or None if a command is to run."""
-    from gs2d.cli import help as helps
-
     words = list(argv)
     if not words:
-        return helps.program_help()
+        return program_help()
     if words[0] == "help":
         words = [*words[1:], "--help"]
     if "--version" in words or words[0] in ("version", "-V"):
@@ -128,9 +126,9 @@ def _help_or_version(argv: Sequence[str]) -> list[str] | None:
     requested = [word for word in words if word in HELP_WORDS]
     everything = "--help-all" in requested
     if requested and words[0] in NAMES:
-        return helps.command_help(words[0], everything=everything)
+        return command_help(words[0], everything=everything)
     if requested and words[0] in HELP_WORDS:
-        return helps.program_help(everything=everything)
+        return program_help(everything=everything)
     return None
 
 

@@ -211,7 +211,7 @@ class RecipesCommand(Common):
     """List all recipes, not only the three for everyday use."""
 
 
-@register_command("doctor", action="gs2d.cli.doctor:doctor", group=BEGIN)
+@_core("doctor", BEGIN)
 @dataclass(frozen=True, kw_only=True)
 class DoctorCommand(Common):
     """Check what this machine can run, and what is missing."""

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from gs2d.data.build import Capture, PosedImage
-from gs2d.data.file_names import in_any_case
+from gs2d.data.file_names import in_any_case, parsed
 from gs2d.data.readers.capture_readers import READERS
-from gs2d.data.readers.common import parsed
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, UnusableViewError
 from gs2d.io.meshes import read_points

@@ -16,11 +16,10 @@ from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import CAMERA_MODELS, Lens
 from gs2d.data.faces import panorama
-from gs2d.data.file_names import Files, in_any_case
+from gs2d.data.file_names import Files, ImageFile, find_photographs, in_any_case
 from gs2d.data.image_files import image_size
 from gs2d.data.masks import FOLDER
 from gs2d.data.prior_maps import DEPTHS, NORMALS, MapFiles
-from gs2d.data.readers.common import ImageFile, find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError, UnusableViewError

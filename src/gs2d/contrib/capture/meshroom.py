@@ -32,8 +32,7 @@ from gs2d.contrib.capture.camera_files import (
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
-from gs2d.data.file_names import in_any_case
-from gs2d.data.readers.common import find_photographs, head
+from gs2d.data.file_names import find_photographs, head, in_any_case
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError

@@ -20,9 +20,8 @@ from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
-from gs2d.data.file_names import in_any_case
+from gs2d.data.file_names import find_photographs, in_any_case
 from gs2d.data.image_files import image_size
-from gs2d.data.readers.common import find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError

@@ -19,11 +19,10 @@ from gs2d.core.image_arrays import is_number, natural_key
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama
-from gs2d.data.file_names import in_any_case
+from gs2d.data.file_names import ImageFile, find_photographs, in_any_case, parsed
 from gs2d.data.image_files import image_size
 from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.readers.capture_readers import register_reader
-from gs2d.data.readers.common import ImageFile, find_photographs, parsed
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import COLMAP_MODELS, Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError, UnusableViewError
