@@ -31,7 +31,7 @@ from gs2d.config.robust import Removal
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
-from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
+from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.image_metrics import image_metrics, psnr_float
 from gs2d.pipeline.prepare.learned_views import photographed
 from gs2d.pipeline.prepare.loaded import Trained
@@ -96,8 +96,8 @@ def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
         "views": by_view,
         "transparent": float(np.mean([score["transparent"] for score in trains])),
         "train": float(np.mean([score["psnr"] for score in trains])),
-        "hidden": total(hidden).fraction,
-        "hidden_worst": max((points.fraction or 0.0 for points in hidden), default=0.0),
+        "hidden": float(np.concatenate(hidden).mean()) if sum(map(len, hidden)) else None,
+        "hidden_worst": max((float(points.mean()) for points in hidden if len(points)), default=0.0),
         "near_weight": near_weight(scene, splats, settings),
         "splats": len(splats),
     }
@@ -111,7 +111,7 @@ def _score(scene: Scene, view: View, splats: Splats, settings: RasterSettings) -
     everywhere = torch.ones(target.shape[:2], dtype=torch.bool) if mask is None else mask
     fit = fit_exposure(output.color, target, everywhere)
     fitted = output.color @ fit[:, :3].T + fit[:, 3]
-    points = HiddenPoints(0, 0)
+    points = np.zeros(0, dtype=bool)
     observed = scene.observed(guessed=False)
     if observed is not None:
         points = hidden_points(output.depth_median.numpy(), observed.in_view(view.name, view.camera))

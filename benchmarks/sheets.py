@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from gs2d.core.splats import Splats
-from gs2d.evaluation.image_metrics import psnr_8bit
+from gs2d.evaluation.image_metrics import psnr_float, quantise
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.prepare.loaded import LoadedRun, reload_run
@@ -33,7 +33,7 @@ def score(splats: Splats, job: LoadedRun) -> tuple[float, float, float]:
     for view in job.scene.test:
         out = rasterize(splats, view.camera, job.settings, backend=job.backend)
         target = torch.from_numpy(view.target(job.settings.background).copy())
-        values.append(float(psnr_8bit(out.color, target, None)))
+        values.append(psnr_float(quantise(out.color).float() / 255, quantise(target).float() / 255))
         alpha = view.alpha()
         if alpha is not None and (alpha < 0.5).any():
             covered.append(float(out.alpha[torch.from_numpy(alpha < 0.5)].mean()))

@@ -25,7 +25,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data import View
 from gs2d.data.subject_box import find_subject
 from gs2d.errors import DataError
-from gs2d.evaluation.hidden_points import hidden_points, total
+from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
@@ -236,20 +236,20 @@ def score_run(path: Path) -> dict[str, Any]:
 
 def hidden_fraction(job: Trained) -> dict[str, Any] | None:
     """Return the share of sparse points hidden by the median depth of test views; None without test views or points."""
-    observed, counts = job.scene.observed(guessed=False), {}
+    observed, hidden = job.scene.observed(guessed=False), {}
     if observed is None or not job.scene.test:
         return None
     for view in job.scene.test:
         depth = job.render(view.camera).depth_median.cpu().numpy()
-        counts[view.name] = hidden_points(np.asarray(depth), observed.in_view(view.name, view.camera))
-    whole = total(list(counts.values()))
-    if whole.fraction is None:
+        hidden[view.name] = hidden_points(np.asarray(depth), observed.in_view(view.name, view.camera))
+    whole = np.concatenate(list(hidden.values()))
+    if not len(whole):
         return None
-    fractions = {name: count.fraction for name, count in counts.items() if count.fraction is not None}
+    fractions = {name: float(found.mean()) for name, found in hidden.items() if len(found)}
     worst = max(fractions, key=lambda name: fractions[name])
     return {
-        "points": whole.shown,
-        "share": round(whole.fraction, 5),
+        "points": len(whole),
+        "share": round(float(whole.mean()), 5),
         "worst_share": round(fractions[worst], 5),
         "worst_view": worst,
     }

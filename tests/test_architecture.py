@@ -91,9 +91,9 @@ INSIDE = {
         "cached_objective whole_steps": 5,
         "first_splats objective resumable": 4,
         "actions densify robust": 3,
-        "optimizer parallel rows": 2,
-        "learned state": 1,
-        "events learned_rows start step_result targets": 0,
+        "learned optimizer parallel rows": 2,
+        "state": 1,
+        "events start step_result targets": 0,
     },
 }
 

@@ -7,18 +7,14 @@ import pytest
 
 from gs2d.core.camera import Camera
 from gs2d.data.prior_maps import ObservedPoints, PointsInView
-from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
+from gs2d.evaluation.hidden_points import hidden_points
 
 POINTS = PointsInView(np.array([[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5]]), np.full(4, 10.0))
 
 
 def test_a_clearly_nearer_surface_occludes_a_point() -> None:
     depth = np.array([[9.4, 9.6, 0.0, 20.0]])  # nearer than 9.5; about there; nothing hit; behind the point
-    assert hidden_points(depth, POINTS) == HiddenPoints(shown=4, hidden=1)
-
-
-def test_counts_of_views_are_summed() -> None:
-    assert total([HiddenPoints(10, 1), HiddenPoints(0, 0), HiddenPoints(30, 3)]) == HiddenPoints(40, 4)
+    assert hidden_points(depth, POINTS).tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize(

@@ -26,10 +26,9 @@ from gs2d.config.quantities import EXPOSURE, POSES
 from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
-from gs2d.core.processes import ProcessRank
 from gs2d.errors import Gs2dError
 from gs2d.training import events
-from gs2d.training.parallel import OneProcess, Turn
+from gs2d.training.parallel import ProcessGroup, Turn
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
 from gs2d.training.trainer import Trainer
@@ -37,12 +36,17 @@ from train_toys import backends, grouped, make_scene, short
 from wall_scene import wall
 
 
-class Batch(OneProcess):
+class Batch(ProcessGroup):
     """Emulates several processes in one: renders the views of an iteration one by one and averages the gradients."""
 
     def __init__(self, views: int) -> None:
-        self.place = ProcessRank(0, views, 0, 1)
+        super().__init__()
+        self.views = views
         self.results: list[StepResult] = []
+
+    @property
+    def size(self) -> int:
+        return self.views
 
     def evaluate(
         self,
@@ -122,7 +126,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
 
 
 def trained(
-    recipe: Recipe, together: OneProcess, state: dict[str, Any] | None = None, **options: Any
+    recipe: Recipe, together: ProcessGroup, state: dict[str, Any] | None = None, **options: Any
 ) -> tuple[TrainState, dict[str, Any]]:
     """Train to the end; return the state, and the recorded losses and resumable states."""
     heard: dict[str, Any] = {"losses": [], "states": []}

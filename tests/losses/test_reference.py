@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,8 +16,10 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from gs2d.errors import ShapeError
 from gs2d.losses import formulas as reference
-from gs2d.losses.base import normals_from_depth
+from gs2d.losses.formulas import normals_from_depth
 from loss_images import make_camera, make_output, plane_depth
+
+per_splat_consistency = partial(reference.normal_consistency, per_splat=True)
 
 
 def test_l1_is_the_mean_absolute_difference_over_pixels_and_channels() -> None:
@@ -128,7 +131,7 @@ def test_with_camera_edges_an_ignored_neighbour_still_leaves_no_normal(mask_one:
     assert normals[4, 3].norm() > 0.5  # the pixel above is empty, not ignored
 
 
-@pytest.mark.parametrize("loss", [reference.normal_consistency, reference.normal_consistency_per_splat])
+@pytest.mark.parametrize("loss", [reference.normal_consistency, per_splat_consistency])
 def test_with_camera_edges_gradients_are_those_of_finite_differences_and_0_where_empty(
     loss: Callable[..., Tensor],
 ) -> None:
@@ -152,7 +155,7 @@ def test_weights_multiply_the_part_of_each_pixel_and_the_count_stays() -> None:
     camera, output = make_camera(9, 8), make_output(8, 9)
     images = (output.normal, output.depth_mean, output.alpha, camera)
     mask = torch.rand(8, 9, generator=torch.Generator().manual_seed(0)) < 0.9
-    for loss in (reference.normal_consistency, reference.normal_consistency_per_splat):
+    for loss in (reference.normal_consistency, per_splat_consistency):
         parts = torch.zeros((), dtype=torch.float64)
         for row in range(2):  # upper and lower half, selected by weights of 0 and 1
             half = torch.zeros(8, 9, dtype=torch.float64)
@@ -228,7 +231,7 @@ def test_normal_consistency_of_a_true_plane_is_one_minus_alpha_squared_inside_an
     value = reference.normal_consistency(rendered, depth, alpha, camera)
     # 24 of 48 pixels are inside: (24 (1 - 0.75^2) + 24) / 48
     assert value.item() == pytest.approx((24 * (1 - 0.5625) + 24) / 48)
-    per_splat = reference.normal_consistency_per_splat(rendered, depth, alpha, camera)
+    per_splat = per_splat_consistency(rendered, depth, alpha, camera)
     assert per_splat.item() == pytest.approx(0, abs=1e-12)  # alpha - alpha <n, N>
 
 
@@ -239,7 +242,7 @@ def test_only_the_per_splat_form_has_a_gradient_through_alpha() -> None:
     assert official[2] is None
     assert official[0].abs().sum() > 0
     assert official[1].abs().sum() > 0
-    per_splat = torch.autograd.grad(reference.normal_consistency_per_splat(*inputs, camera), inputs)
+    per_splat = torch.autograd.grad(per_splat_consistency(*inputs, camera), inputs)
     expected = torch.zeros(5, 6, dtype=torch.float64)
     expected[1:-1, 1:-1] = 1 / 30  # d/d alpha of the mean, where N is defined
     torch.testing.assert_close(per_splat[2], expected)

@@ -22,7 +22,7 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import perturb_pose
 from gs2d.errors import ShapeError
 from gs2d.losses.base import LossView, compute_losses
-from gs2d.losses.formulas import normal_consistency, normal_consistency_per_splat
+from gs2d.losses.formulas import normal_consistency
 from gs2d.render import pose_gradient as camera_gradient
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
@@ -234,8 +234,8 @@ def test_20_normal_consistency_lets_both_normals_rotate_with_the_camera(kind: st
     mask = torch.tensor(rng.random((camera.height, camera.width)) < 0.8) if masked else None
     lens, expected = live(camera)
     output = reference.rasterize(splats, lens, RasterSettings())
-    judge = {"normal_consistency": normal_consistency, "normal_consistency_per_splat": normal_consistency_per_splat}
-    judge[kind](output.normal, output.depth_mean, output.alpha, lens, mask).backward()
+    images = output.normal, output.depth_mean, output.alpha
+    normal_consistency(*images, lens, mask, per_splat=kind == "normal_consistency_per_splat").backward()
 
     def found(change: Any = lambda output: output) -> Tensor:
         lens, pose = learning(camera)

@@ -11,7 +11,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
 from gs2d.config.robust import FEW_VIEWS, Removal
 from gs2d.render.api import rasterize
-from gs2d.training.robust.dropout import dropout_rate, dropped_out, kept_splats
+from gs2d.training.robust.regularise import dropout_rate, dropped_out, kept_splats
 from gs2d.training.trainer import Trainer
 from train_toys import make_scene, short
 

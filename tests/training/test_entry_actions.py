@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import pytest
 import torch
 
-from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR, Action
+from gs2d.config.actions import ACTIONS, CLONE_IN_PLACE, RANK_BY_ERROR, Action
 from gs2d.errors import DivergedError, RecipeError
 from gs2d.render.api import rasterize
 from gs2d.training import events
 from gs2d.training.actions.clone_in_place import CloneInPlace
-from gs2d.training.actions.entry_action import StageEntry, action_of
+from gs2d.training.actions.entry_action import StageEntry
 from gs2d.training.actions.rank_by_error import RankByError, worst
 from gs2d.training.state import TrainState
 from train_toys import full_state, make_scene, random_splats
@@ -50,7 +50,7 @@ def test_options_that_an_action_does_not_take_are_refused() -> None:
         (Action("clone_in_place"), "does not take the options"),
     ):
         with pytest.raises(RecipeError, match=message):
-            action_of(action, "refine")
+            ACTIONS.make(action.name, options=action.options)
 
 
 def test_a_clone_is_an_exact_copy_in_the_groups_of_its_original() -> None:

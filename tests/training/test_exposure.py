@@ -25,8 +25,8 @@ from gs2d.render.exposure_transform import _gradients
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.cached_objective import CachedViews
-from gs2d.training.learned.appearance import shown, shown_splats
 from gs2d.training.learned.image_exposure import ImageExposure
+from gs2d.training.learned.learned_table import shown, shown_splats
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.objective import clipped_pixels
 from gs2d.training.state import TrainState

@@ -16,7 +16,7 @@ from gs2d.core.sh import rgb_to_sh0
 from gs2d.data.scene import View
 from gs2d.render.backends import get_backend
 from gs2d.training.objective import FullRender
-from gs2d.training.robust.opaque import BACKGROUNDS, FROM, another_background
+from gs2d.training.robust.regularise import BACKGROUNDS, FROM, another_background
 from gs2d.training.targets import Targets
 from train_toys import full_state, make_scene
 

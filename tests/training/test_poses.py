@@ -20,7 +20,6 @@ from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.cached_objective import CachedViews
 from gs2d.training.learned.camera_pose import CameraPose
-from gs2d.training.objective import Rendered
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from learned_rows import begun
@@ -96,7 +95,7 @@ def test_the_pose_gradient_is_that_of_the_loss(scene: Scene) -> None:
             for sign in (1, -1):
                 there = perturb_pose(camera, sign * motion * torch.tensor([1.0] * 3 + [scene.extent] * 3))
                 output = rasterize(state.splats, there, whole.settings(recipe.stages[0], 1), backend=backend)
-                terms = whole.differentiate(state, recipe.stages[0], 1, Rendered(2, there, output, {})).losses
+                terms = whole.differentiate(state, recipe.stages[0], 1, 2, there, output, {}).losses
                 values.append(float(sum(terms.values())))
             slope = (values[0] - values[1]) / (2 * step)
             assert slope == pytest.approx(float(found[backend][k]), rel=1e-3, abs=1e-5)

@@ -24,7 +24,6 @@ from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.learned.camera_intrinsics import CameraIntrinsics
 from gs2d.training.learned.learned_table import LearnedTable
-from gs2d.training.objective import Rendered
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from learned_rows import Learner, begun
@@ -75,9 +74,7 @@ def test_gradients_of_the_intrinsics_are_those_of_the_loss(scene: Scene, kind: s
                 rows.values[:, k] += sign * step
                 there = whole.camera(state, 2)
                 output = rasterize(state.splats, there, whole.settings(stage, 1), backend=backend)
-                values.append(
-                    float(sum(whole.differentiate(state, stage, 1, Rendered(2, there, output, {})).losses.values()))
-                )
+                values.append(float(sum(whole.differentiate(state, stage, 1, 2, there, output, {}).losses.values())))
             rows.values[:] = start
             slope = (values[0] - values[1]) / (2 * step)
             assert slope == pytest.approx(float(found[backend][k]), rel=1e-3, abs=1e-5)

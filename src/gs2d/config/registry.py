@@ -101,6 +101,22 @@ class Registry(Generic[T]):
             return self._load(name)
         raise self._error(self.unknown(name))
 
+    def make(self, name: str, *arguments: object, options: Mapping[str, Any], where: str = "") -> Any:
+        """Return an object of a registered class, made with its options; ``where`` begins the error message.
+
+        Raises
+        ------
+        Gs2dError
+            As :meth:`get`, or if the class does not take the options.
+        """
+        kind: Any = self.get(name)
+        try:
+            return kind(*arguments, **options)
+        except TypeError as error:
+            raise self._error(
+                f"{where}{self.what} {name!r} does not take the options {dict(options)}: {error}"
+            ) from error
+
     def __getitem__(self, name: str) -> T:
         return self.get(name)
 

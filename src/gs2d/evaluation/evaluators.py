@@ -64,20 +64,11 @@ def register_evaluator(name: str) -> Callable[[Register], Register]:
 
 @dataclass(frozen=True, eq=False)
 class FoundTruth:
-    """A ground truth, and the evaluator that found it.
+    """A ground truth, and the evaluator that found it."""
 
-    Attributes
-    ----------
-    name : str
-        Of the evaluator.
-    evaluator : Evaluator
-    truth : object
-        From ``evaluator.find``.
-    """
-
-    name: str
+    name: str  # of the evaluator
     evaluator: Evaluator
-    truth: Any
+    truth: Any  # from ``evaluator.find``
 
 
 def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | None:
@@ -85,10 +76,7 @@ def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | 
 
     Evaluators of data sets come first, then the general one.
 
-    Raises
-    ------
-    DataError
-        If ``given`` contains no ground truth of this capture.
+    Raise DataError if ``given`` contains no ground truth of this capture.
     """
     for name, make in sorted(EVALUATORS.working(), key=lambda item: item[0] == GENERAL):
         evaluator = make()

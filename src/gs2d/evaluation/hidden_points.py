@@ -6,9 +6,6 @@ smaller, the splats form floaters between camera and surface.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
 from gs2d.data.prior_maps import PointsInView
@@ -16,21 +13,8 @@ from gs2d.data.prior_maps import PointsInView
 NEARER = 0.95  # of a point's depth: a nearer surface occludes it; SfM depths have errors of a few percent
 
 
-@dataclass(frozen=True)
-class HiddenPoints:
-    """Number of sparse points in a view, and how many of them its rendering occludes."""
-
-    shown: int
-    hidden: int
-
-    @property
-    def fraction(self) -> float | None:
-        """Fraction of the points that are occluded; None without points."""
-        return self.hidden / self.shown if self.shown else None
-
-
-def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NEARER) -> HiddenPoints:
-    """Count the points of a view that are behind its rendered surface.
+def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NEARER) -> np.ndarray:
+    """Return which points of a view are behind its rendered surface, [M] bool.
 
     Parameters
     ----------
@@ -43,10 +27,4 @@ def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NE
     """
     columns, rows = np.floor(points.pixels).astype(np.int64).T
     surface = np.asarray(depth)[rows, columns]
-    hidden = (surface > 0) & (surface < nearer * points.depth)
-    return HiddenPoints(len(points.depth), int(hidden.sum()))
-
-
-def total(views: Sequence[HiddenPoints]) -> HiddenPoints:
-    """Sum the counts of several views."""
-    return HiddenPoints(sum(view.shown for view in views), sum(view.hidden for view in views))
+    return np.asarray((surface > 0) & (surface < nearer * points.depth))

@@ -29,26 +29,14 @@ class Metric:
 
 @dataclass(frozen=True)
 class ImageMetrics:
-    """Similarity of a rendered image and its target.
+    """Similarity of a rendered image and its target."""
 
-    Attributes
-    ----------
-    psnr, ssim : Metric
-        In dB, and in [-1, 1], of the image quantised to 8 bits (official evaluation).
-    psnr_float, ssim_float : Metric
-        Of the float image.
-    lpips : Metric
-        VGG LPIPS of the 8-bit image scaled to [0, 1] (as 3DGS and 2DGS report).
-    lpips_signed : Metric
-        VGG LPIPS of the 8-bit image scaled to [-1, 1] (convention of its authors).
-    """
-
-    psnr: Metric
-    ssim: Metric
-    psnr_float: Metric
-    ssim_float: Metric
-    lpips: Metric
-    lpips_signed: Metric
+    psnr: Metric  # dB, of the image quantised to 8 bits (official evaluation)
+    ssim: Metric  # in [-1, 1], of the same
+    psnr_float: Metric  # of the float image
+    ssim_float: Metric  # of the float image
+    lpips: Metric  # VGG LPIPS of the 8-bit image scaled to [0, 1] (as 3DGS and 2DGS report)
+    lpips_signed: Metric  # VGG LPIPS of the 8-bit image scaled to [-1, 1] (convention of its authors)
 
     def to_json(self) -> dict[str, float | str | None]:
         """Return each value by name, and ``<name>_reason`` for values that are null or incomplete."""
@@ -65,12 +53,10 @@ def quantise(image: Tensor) -> Tensor:
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 
-def _as_8bit(image: Tensor) -> Tensor:
-    return quantise(image).to(image.dtype) / 255
-
-
 def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the PSNR in dB: -10 log10 of the mean squared error over valid pixels and channels.
+
+    It is ``inf`` for equal images, ``nan`` if no pixel is valid.
 
     Parameters
     ----------
@@ -78,11 +64,6 @@ def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
         In [0, 1]; the image is clamped to it.
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
-
-    Returns
-    -------
-    float
-        ``inf`` for equal images, ``nan`` if no pixel is valid.
     """
     check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
     squared = image.detach().clamp(0, 1).double()  # [H, W, 3]
@@ -97,11 +78,6 @@ def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def psnr_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return ``psnr_float`` of both images quantised to 8 bits."""
-    return psnr_float(_as_8bit(image), _as_8bit(target), mask)
-
-
 def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend: str | Backend) -> float:
     """Return the mean SSIM over valid pixels (11x11 Gaussian window, zero padding, as in the loss); ``nan`` if none is.
 
@@ -112,11 +88,6 @@ def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, bac
         return math.nan
     with torch.no_grad():
         return float(losses.ssim(image.clamp(0, 1), target, mask, backend=backend))
-
-
-def ssim_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend: str | Backend) -> float:
-    """Return ``ssim_float`` of both images quantised to 8 bits."""
-    return ssim_float(_as_8bit(image), _as_8bit(target), mask, backend=backend)
 
 
 def _metric(value: float) -> Metric:
@@ -135,7 +106,7 @@ def _lpips(network: Lpips | None, image: Tensor, target: Tensor, mask: Tensor | 
             return Metric(None, "no valid pixel")
         image = torch.where(mask[..., None], image, target)
     with torch.no_grad():
-        pair = (_as_8bit(image).float().to(network.device), _as_8bit(target).float().to(network.device))
+        pair = (image.float().to(network.device), target.float().to(network.device))
         return _metric(float(network(*pair, convention=convention)))
 
 
@@ -155,17 +126,17 @@ def image_metrics(
         In [0, 1]; the image is clamped to it.
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel. For LPIPS, the target replaces the image there, and the mean is over all pixels.
-    backend : str or Backend
     lpips : Lpips, optional
         From ``evaluation.lpips.load_lpips``; without it LPIPS is null, with a remedy as the reason.
     """
+    rounded = quantise(image).to(image.dtype) / 255, quantise(target).to(target.dtype) / 255
     return ImageMetrics(
-        psnr=_metric(psnr_8bit(image, target, mask)),
-        ssim=_metric(ssim_8bit(image, target, mask, backend=backend)),
+        psnr=_metric(psnr_float(*rounded, mask)),
+        ssim=_metric(ssim_float(*rounded, mask, backend=backend)),
         psnr_float=_metric(psnr_float(image, target, mask)),
         ssim_float=_metric(ssim_float(image, target, mask, backend=backend)),
-        lpips=_lpips(lpips, image, target, mask, "0..1"),
-        lpips_signed=_lpips(lpips, image, target, mask, "-1..1"),
+        lpips=_lpips(lpips, *rounded, mask, "0..1"),
+        lpips_signed=_lpips(lpips, *rounded, mask, "-1..1"),
     )
 
 

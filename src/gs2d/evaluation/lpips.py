@@ -58,10 +58,7 @@ class Lpips:
     def __call__(self, image: Tensor, target: Tensor, *, convention: str = "0..1") -> Tensor:
         """Return the distance [] of two images [H, W, 3] with values in [0, 1], in float32 on every device.
 
-        Raises
-        ------
-        ShapeError
-            If the images have different or too small sizes, or the convention is unknown.
+        Raise ShapeError if the images have different or too small sizes, or the convention is unknown.
         """
         if convention not in CONVENTIONS:
             raise ShapeError(f"LPIPS convention must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
@@ -124,10 +121,7 @@ def _expected() -> dict[str, tuple[int, ...]]:
 def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu") -> Lpips:
     """Read the weights from files, or from a folder with .pth and .pt files.
 
-    Raises
-    ------
-    DataError
-        If a file is missing or no state dict, or weights are missing or have another shape.
+    Raise DataError if a file is missing or no state dict, or weights are missing or have another shape.
     """
     sources = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     files: list[Path] = []

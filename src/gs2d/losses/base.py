@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gs2d.config.loss_registry import LOSSES, register_loss
+from gs2d.config.loss_registry import LOSSES
 from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
@@ -26,21 +26,8 @@ from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError, ShapeError
 from gs2d.kernels.loss_operations import LossOperations
 from gs2d.losses import formulas
-from gs2d.losses.formulas import normals_from_depth
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RenderOutput
-
-__all__ = [
-    "LOSSES",
-    "Loss",
-    "LossView",
-    "Losses",
-    "compute_losses",
-    "losses_of",
-    "normals_from_depth",
-    "register_loss",
-    "ssim",
-]
 
 SETTINGS = ("depth_prior", "normal_prior")
 """Fields of a recipe that only losses use."""
@@ -194,17 +181,7 @@ def _make(term: LossTerm) -> Loss:
 
 
 class Losses:
-    """The losses of some terms, each made once by kind and options.
-
-    Parameters
-    ----------
-    terms : iterable of LossTerm
-
-    Raises
-    ------
-    RecipeError
-        If a loss does not take its options.
-    """
+    """The losses of some terms, each made once by kind and options; RecipeError if a loss does not take its options."""
 
     def __init__(self, terms: Iterable[LossTerm]) -> None:
         self._losses: dict[tuple[str, str], Loss] = {}
@@ -224,10 +201,6 @@ class Losses:
         for _, loss in self:
             loss.prepare(scene, recipe, device)
 
-    def needing(self, need: str, terms: Sequence[LossTerm]) -> list[LossTerm]:
-        """Return the terms whose loss needs an entry of ``gs2d.config.loss_registry.NEEDS``."""
-        return [term for term in terms if need in self[term].needs]
-
 
 def _key(term: LossTerm) -> tuple[str, str]:
     return term.kind, json.dumps(dict(term.options), sort_keys=True, default=str) if term.options else "{}"
@@ -236,10 +209,8 @@ def _key(term: LossTerm) -> tuple[str, str]:
 def losses_of(recipe: Recipe) -> Losses:
     """Return the losses of a recipe; they are not prepared.
 
-    Raises
-    ------
-    RecipeError
-        If a loss does not take its options, or a loss and the settings of the recipe that it needs are not both there.
+    Raise RecipeError if a loss does not take its options, or a loss and the settings of the recipe that it needs are
+    not both there.
     """
     losses, where = Losses(term for stage in recipe.stages for term in stage.losses), f"recipe {recipe.name!r}"
     used = {loss.settings for _, loss in losses}
@@ -336,12 +307,6 @@ def ssim(
     image, target : Tensor [H, W, 3]
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
-    backend : str or Backend
-
-    Raises
-    ------
-    BackendError
-        If the backend cannot run here.
     """
     fused = _operations(backend, image.device)
     if fused is not None:

@@ -168,16 +168,23 @@ def normal_consistency(
     *,
     edges: str = "undefined",
     weights: Tensor | None = None,
+    per_splat: bool = False,
 ) -> Tensor:
     """Return the mean of 1 - alpha <normal, N>, alpha detached, N from ``depth`` (form of the official 2DGS code).
 
     A pixel with undefined N (border, not hit, ignored neighbour) contributes 1. ``edges`` is that of
     :func:`normals_from_depth`. ``weights`` [H, W] are constant factors of the pixels; the sum is still divided by the
-    number of pixels.
+    number of pixels. With ``per_splat``, it is the mean of sum_i w_i (1 - <n_i, N>) = alpha - <normal, N>, nothing
+    detached (the paper's Eq. 7), and a pixel with undefined N contributes 0.
     """
     surface = normals_from_depth(depth, camera, mask, edges=edges)
     normal, alpha = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha))
-    return masked_mean(_weighted(1 - alpha.detach() * (normal * surface).sum(dim=-1), weights), mask)
+    agreement = (normal * surface).sum(dim=-1)
+    values = alpha - agreement if per_splat else 1 - alpha.detach() * agreement
+    values = values if weights is None else weights.detach() * values
+    if per_splat:
+        values = torch.where((surface.detach() != 0).any(dim=-1), values, torch.zeros_like(values))
+    return masked_mean(values, mask)
 
 
 def object_weights(alpha: Tensor, silhouette: Tensor | None = None) -> Tensor:
@@ -245,36 +252,6 @@ def _shifted(image: Tensor, axis: int) -> Tensor:
 def flat_weights(flat: Tensor, factor: float, dtype: torch.dtype) -> Tensor:
     """Return pixel weights [H, W] from 1 (texture) to ``factor`` (none), from the bytes of :func:`flatness`."""
     return 1 + (factor - 1) * (flat.to(dtype) / 255)
-
-
-def _weighted(values: Tensor, weights: Tensor | None) -> Tensor:
-    return values if weights is None else weights.detach() * values
-
-
-def normal_consistency_per_splat(
-    normal: Tensor,
-    depth: Tensor,
-    alpha: Tensor,
-    camera: Camera,
-    mask: Tensor | None = None,
-    *,
-    edges: str = "undefined",
-    weights: Tensor | None = None,
-) -> Tensor:
-    """Return the mean of sum_i w_i (1 - <n_i, N>) = alpha - <normal, N>, nothing detached (the paper's Eq. 7).
-
-    A pixel with undefined N contributes 0. ``edges`` and ``weights`` are those of :func:`normal_consistency`.
-    """
-    surface = normals_from_depth(depth, camera, mask, edges=edges)
-    normal, alpha = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha))
-    defined = (surface.detach() != 0).any(dim=-1)
-    value = _weighted(alpha - (normal * surface).sum(dim=-1), weights)
-    return masked_mean(torch.where(defined, value, torch.zeros_like(value)), mask)
-
-
-def distortion(distortion_map: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the mean of the rendered distortion map over valid pixels."""
-    return masked_mean(distortion_map, mask)
 
 
 def silhouette(alpha: Tensor, target_alpha: Tensor, mask: Tensor | None = None) -> Tensor:

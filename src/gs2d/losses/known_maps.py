@@ -30,32 +30,18 @@ def has_priors(recipe: Recipe) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class DepthPlan:
-    """Interpretation of the known depths of a capture.
+    """Interpretation of the known depths of a capture."""
 
-    Attributes
-    ----------
-    source : "sparse", "sensor" or "relative"
-    observed : ObservedPoints or None
-        None if they are unknown or not needed.
-    unit : float or None
-        World units of a value of 1 in all sensor maps; None: the unit of each file.
-    space : "disparity" or "depth"
-        Quantity that relative maps are linear in.
-    """
-
-    source: str
-    observed: ObservedPoints | None = None
-    unit: float | None = None
-    space: str = "disparity"
+    source: str  # "sparse", "sensor" or "relative"
+    observed: ObservedPoints | None = None  # None if they are unknown or not needed
+    unit: float | None = None  # world units of a value of 1 in all sensor maps; None: the unit of each file
+    space: str = "disparity"  # "disparity" or "depth": the quantity that relative maps are linear in
 
 
 def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
     """Choose the source of known depths of a capture, and how it is read.
 
-    Raises
-    ------
-    DataError
-        If the capture lacks the requested source.
+    Raise DataError if the capture lacks the requested source.
     """
     mapped = [view for view in scene.train if view.maps is not None and view.maps.files.depth is not None]
     source = settings.source
@@ -96,10 +82,7 @@ def _asked(mapped: list[View]) -> list[View]:
 def _fitted_unit(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> float | None:
     """Return the unit that fits the maps to the points; None without points.
 
-    Raises
-    ------
-    DataError
-        If too few points lie on known pixels.
+    Raise DataError if too few points lie on known pixels.
     """
     if observed is None:
         return None
@@ -165,10 +148,7 @@ class Priors:
 
     The default limit is 1 GiB in host memory and 4 GiB on a device. Others are decoded each time.
 
-    Raises
-    ------
-    DataError
-        From the constructor, if the capture lacks what the recipe requests.
+    The constructor raises DataError if the capture lacks what the recipe requests.
     """
 
     def __init__(
@@ -266,10 +246,7 @@ def _around(points: PointsInView, width: int) -> tuple[np.ndarray, np.ndarray, n
 def plan_normals(scene: Scene, settings: NormalPrior) -> str:
     """Return the axes of a capture's normal maps: "opencv" or "opengl".
 
-    Raises
-    ------
-    DataError
-        If there are none, or they do not face the camera.
+    Raise DataError if there are none, or they do not face the camera.
     """
     mapped = [view for view in scene.train if view.maps is not None and view.maps.files.normal is not None]
     if not mapped:

@@ -22,68 +22,36 @@ NOISE = 0.05  # relative error that known depths may have: below it the loss is 
 
 @dataclass(frozen=True, eq=False)
 class PointDepths:
-    """Depths of sparse points in an image.
+    """Depths of sparse points in an image."""
 
-    Attributes
-    ----------
-    pixels : Tensor [M, 4] int64
-        The four pixels around each point, as indices into the flattened image.
-    weights : Tensor [M, 4]
-        Bilinear weights of their disparities; exact on a plane.
-    depth : Tensor [M] world units
-    """
-
-    pixels: Tensor
-    weights: Tensor
-    depth: Tensor
+    pixels: Tensor  # [M, 4] int64: the four pixels around each point, as indices into the flattened image
+    weights: Tensor  # [M, 4]: bilinear weights of their disparities; exact on a plane
+    depth: Tensor  # [M] world units
 
 
 @dataclass(frozen=True, eq=False)
 class MetricDepth:
-    """A depth map in units of the scene.
+    """A depth map in units of the scene."""
 
-    Attributes
-    ----------
-    disparity : Tensor [H, W], 1 / world unit
-    valid : Tensor [H, W] bool
-    """
-
-    disparity: Tensor
-    valid: Tensor
+    disparity: Tensor  # [H, W], 1 / world unit
+    valid: Tensor  # [H, W] bool
 
 
 @dataclass(frozen=True, eq=False)
 class RelativeDepths:
-    """A depth map of unknown scale and shift, which is fitted to the rendered depth.
+    """A depth map of unknown scale and shift, which is fitted to the rendered depth."""
 
-    Attributes
-    ----------
-    values : Tensor [H, W]
-        Standardised to mean 0 and deviation 1; 0 where unknown.
-    valid : Tensor [H, W] bool
-    space : "disparity" or "depth"
-        Quantity that the values are linear in.
-    """
-
-    values: Tensor
-    valid: Tensor
-    space: str
+    values: Tensor  # [H, W]: standardised to mean 0 and deviation 1; 0 where unknown
+    valid: Tensor  # [H, W] bool
+    space: str  # "disparity" or "depth": the quantity that the values are linear in
 
 
 @dataclass(frozen=True, eq=False)
 class NormalTarget:
-    """Unit normals in the world frame.
+    """Unit normals in the world frame."""
 
-    Attributes
-    ----------
-    directions : Tensor [H, W, 3]
-        0 where unknown.
-    valid : Tensor [H, W]
-        1 where known, else 0.
-    """
-
-    directions: Tensor
-    valid: Tensor
+    directions: Tensor  # [H, W, 3]: 0 where unknown
+    valid: Tensor  # [H, W]: 1 where known, else 0
 
 
 Depths = PointDepths | MetricDepth | RelativeDepths

@@ -131,8 +131,8 @@ class NormalConsistency(Loss):
         return _normals(output, view), output.depth(view.depth_kind), output.alpha
 
     def _plain(self, images: tuple[Tensor, Tensor, Tensor], view: LossView, weights: Tensor | None) -> Tensor:
-        form = formulas.normal_consistency_per_splat if self.per_splat else formulas.normal_consistency
-        return form(*images, view.camera, view.mask, edges=self.edges, weights=weights)
+        options = {"edges": self.edges, "weights": weights, "per_splat": self.per_splat}
+        return formulas.normal_consistency(*images, view.camera, view.mask, **options)  # type: ignore[arg-type]
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
         return self._plain(self._images(output, view), view, self._weights(output, view))
@@ -194,7 +194,7 @@ class Distortion(Loss):
     """Mean of the distortion map."""
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
-        return formulas.distortion(output.distortion, view.mask)
+        return formulas.masked_mean(output.distortion, view.mask)
 
     def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
         """Return the mean by the fused operation."""

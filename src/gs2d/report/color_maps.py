@@ -37,17 +37,13 @@ def depth_scale(steps: int) -> np.ndarray:
 
 
 def normal_image(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Return world normals as colours, (n + 1) / 2, over white.
+    """Return world normals as colours, (n + 1) / 2, over white, float32 [H, W, 3] in [0, 1].
 
     Parameters
     ----------
     normal : ndarray [H, W, 3]
         Normals of any length, as in ``RenderOutput.normal``; zero vectors are white.
     alpha : ndarray [H, W]
-
-    Returns
-    -------
-    ndarray float32 [H, W, 3] in [0, 1]
     """
     check_shapes({"normal": (normal, "H W 3"), "alpha": (alpha, "H W")})
     length = np.linalg.norm(normal, axis=2, keepdims=True)
@@ -70,7 +66,7 @@ def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
 
 
 def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
-    """Return depth as colours from near (light) to far (dark), over white.
+    """Return depth as colours from near (light) to far (dark), over white, float32 [H, W, 3] in [0, 1].
 
     Parameters
     ----------
@@ -79,10 +75,6 @@ def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float
     alpha : ndarray [H, W]
     limits : (near, far) world units, optional
         Default: :func:`depth_limits` of this image.
-
-    Returns
-    -------
-    ndarray float32 [H, W, 3] in [0, 1]
     """
     near, far = depth_limits(depth, alpha) if limits is None else limits
     cover = np.where((depth > 0) & np.isfinite(depth), np.clip(alpha, 0, 1), 0.0)[..., None]
@@ -93,16 +85,14 @@ def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float
 def error_image(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Return the mean absolute error over channels, from black at 0 to pale yellow at :data:`ERROR_TOP` and above.
 
+    The result is float32 [H, W, 3] in [0, 1].
+
     Parameters
     ----------
     color, photo : ndarray [H, W, 3] in [0, 1]
         The rendering is clipped to [0, 1].
     mask : ndarray [H, W] bool, optional
         False = this pixel is ignored: it shows grey.
-
-    Returns
-    -------
-    ndarray float32 [H, W, 3] in [0, 1]
     """
     check_shapes({"photo": (photo, "H W 3"), "color": (color, "H W 3")})
     error = np.abs(np.clip(color, 0, 1) - photo).mean(axis=2)
@@ -134,7 +124,7 @@ def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
 
 
 def highlight_image(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the high-error splats in magenta over a pale grey image.
+    """Return the high-error splats in magenta over a pale grey image, float32 [H, W, 3] in [0, 1].
 
     Parameters
     ----------
@@ -142,10 +132,6 @@ def highlight_image(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
         The rendering.
     weight : ndarray [H, W] in [0, 1]
         Sum of their blending weights in each pixel.
-
-    Returns
-    -------
-    ndarray float32 [H, W, 3] in [0, 1]
     """
     check_shapes({"color": (color, "H W 3"), "weight": (weight, "H W")})
     grey = np.clip(color, 0, 1) @ np.array([0.2126, 0.7152, 0.0722])

@@ -60,13 +60,7 @@ def _read(path: Path) -> np.ndarray | None:
 
 
 def read_gallery(renders: Path) -> Gallery | None:
-    """Return the gallery, or None where there is no ``index.json``.
-
-    Raises
-    ------
-    DataError
-        If the index is broken.
-    """
+    """Return the gallery, or None where there is no ``index.json``; raise DataError if the index is broken."""
     path = renders / "index.json"
     if not path.is_file():
         return None

@@ -26,25 +26,14 @@ from gs2d.core.text import name_bytes
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two images of one view with a movable line between them.
+    """Two images of one view with a movable line between them."""
 
-    Attributes
-    ----------
-    images : two ndarrays [H, W, 3 or 4]
-        Left and right of the line.
-    names : two str
-    title : str
-    full : two str
-        Paths of the full-size images relative to the report; shown when the pair is enlarged.
-    width : int
-        Largest width in the report, px.
-    """
-
-    images: tuple[np.ndarray, np.ndarray]
+    images: tuple[np.ndarray, np.ndarray]  # [H, W, 3 or 4], left and right of the line
     names: tuple[str, str]
     title: str
+    # Paths of the full-size images relative to the report; shown when the pair is enlarged.
     full: tuple[str, str]
-    width: int = 800
+    width: int = 800  # largest width in the report, px
 
     @property
     def ratio(self) -> float:

@@ -29,30 +29,19 @@ ABOVE = (0.4, -0.8, 0.45)  # direction of the first view of a run without camera
 
 @dataclass(frozen=True, eq=False)
 class MeshView:
-    """A mesh as the page reads it.
+    """A mesh as the page reads it."""
 
-    Attributes
-    ----------
-    orbit : str
-        JSON: centre, radius, up direction and first position of the eye.
-    data : str
-        Base64 of a gzip file of a ``meshing.web_mesh`` block.
-    faces : int
-        Faces of the whole mesh.
-    shown : int
-        Faces in ``data``.
-    is_textured : bool
-    """
-
-    orbit: str
-    data: str
-    faces: int
-    shown: int
+    orbit: str  # JSON: centre, radius, up direction and first position of the eye
+    data: str  # base64 of a gzip file of a ``meshing.web_mesh`` block
+    faces: int  # faces of the whole mesh
+    shown: int  # faces in ``data``
     is_textured: bool = False
 
 
 def mesh_view(run: Path, cameras: Sequence[Camera]) -> MeshView | str:
     """Return the mesh of a run for the page, textured if there is a texture, or the reason why there is none.
+
+    Raise DataError if the mesh file is broken.
 
     Parameters
     ----------
@@ -60,11 +49,6 @@ def mesh_view(run: Path, cameras: Sequence[Camera]) -> MeshView | str:
         Run folder.
     cameras : sequence of Camera
         The orbit starts at the first camera. Empty: above the mesh, with the third axis up.
-
-    Raises
-    ------
-    DataError
-        If the mesh file is broken.
     """
     path = run / MESH
     if not path.is_file():

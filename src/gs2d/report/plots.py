@@ -26,16 +26,10 @@ class StageSpan:
 
 @dataclass(frozen=True)
 class History:
-    """The series of a log over iterations, which count over all stages.
-
-    Attributes
-    ----------
-    stages : tuple of StageSpan
-    series : mapping of name to (iterations, values)
-        "splats", "mean_opacity", "mean_area", "psnr", and "loss/<term>" for each term.
-    """
+    """The series of a log over iterations, which count over all stages."""
 
     stages: tuple[StageSpan, ...] = ()
+    # (iterations, values) of "splats", "mean_opacity", "mean_area", "psnr", and "loss/<term>" for each term.
     series: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
@@ -86,7 +80,6 @@ def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dic
 
     Parameters
     ----------
-    history : History
     stage_psnr : mapping of stage name to PSNR at its end, dB
         Scores of the ``split`` views; drawn as points.
     """
@@ -121,9 +114,11 @@ def draw_stages(
 ) -> None:
     """Draw one line per stage, without connecting stages."""
     for span in history.stages if name in history.series else ():
-        x, y = _within(history, name, span)
-        if not len(x):
+        x, y = history.series[name]
+        within = ((x > span.start) if span.start else (x >= 0)) & (x <= span.stop)
+        if not within.any():
             continue
+        x, y = x[within], y[within]
         if smooth and len(x) > 30:
             axes.plot(x, y, color=color, linewidth=0.6, alpha=0.25, zorder=order)
             y = smoothed(y)
@@ -162,15 +157,8 @@ def _figure(
         x_marks, y_marks = list(marks[1]), list(marks[1].values())
         axes.plot(x_marks, y_marks, "o", color=_COLORS[1], markersize=5, label=marks[0], clip_on=False)
         for x_mark, y_mark in marks[1].items():
-            axes.annotate(
-                f"{y_mark:.2f}",
-                (x_mark, y_mark),
-                (-5, 5),
-                textcoords="offset points",
-                ha="right",
-                fontsize=8,
-                color=INK,
-            )
+            style = {"textcoords": "offset points", "ha": "right", "fontsize": 8, "color": INK}
+            axes.annotate(f"{y_mark:.2f}", (x_mark, y_mark), (-5, 5), **style)
     dress_axes(axes, history, log=log, legend=any(lines) or bool(marks and marks[1]))
     return svg_text(figure)
 
@@ -197,12 +185,6 @@ def svg_text(figure: Any) -> str:
     with matplotlib.rc_context({"svg.hashsalt": "gs2d"}):  # the same run gives the same bytes
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
     return text.getvalue()
-
-
-def _within(history: History, name: str, span: StageSpan) -> tuple[np.ndarray, np.ndarray]:
-    x, y = history.series[name]
-    chosen = (x > span.start) & (x <= span.stop) if span.start else (x >= 0) & (x <= span.stop)
-    return x[chosen], y[chosen]
 
 
 def dress_axes(axes: Any, history: History, *, log: bool, legend: bool) -> None:

@@ -21,7 +21,10 @@ from gs2d.report.sections.section_registry import SECTIONS, Section
 
 
 def write_report(run: Path, *, on_failure: OnFailure | None = None) -> Path:
-    """Write ``report.html`` into a run folder.
+    """Write ``report.html`` into a run folder, and return its path.
+
+    Raise RunError if the folder is not a run, DataError if ``run.json``, ``metrics.json`` or ``events.jsonl`` is
+    broken, DiskError if the report cannot be written.
 
     Parameters
     ----------
@@ -29,20 +32,6 @@ def write_report(run: Path, *, on_failure: OnFailure | None = None) -> Path:
         A run folder, finished or not.
     on_failure : callable, optional
         Receives the name and the error of each part that fails; the report shows the error in its place.
-
-    Returns
-    -------
-    Path
-        The report.
-
-    Raises
-    ------
-    RunError
-        If the folder is not a run.
-    DataError
-        If ``run.json``, ``metrics.json`` or ``events.jsonl`` is broken.
-    DiskError
-        If the report cannot be written.
     """
     record, guard = read_record(run), Guard(on_failure)
     body = [first_screen(record, guard), *_sections(record, guard)]

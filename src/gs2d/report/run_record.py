@@ -16,27 +16,13 @@ from gs2d.io.run_dir import open_run
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run, as the sections of its report read it.
+    """A run, as the sections of its report read it."""
 
-    Attributes
-    ----------
-    path : Path
-        The run folder.
-    definition : dict
-        ``run.json``.
-    stages : tuple of dict
-        Entries of ``metrics.json``, one per finished stage.
-    surface : dict or None
-        Surface metrics.
-    events : list of dict
-        ``events.jsonl``.
-    """
-
-    path: Path
-    definition: dict[str, Any]
-    stages: tuple[dict[str, Any], ...] = ()
-    surface: dict[str, Any] | None = None
-    events: Sequence[dict[str, Any]] = ()
+    path: Path  # the run folder
+    definition: dict[str, Any]  # ``run.json``
+    stages: tuple[dict[str, Any], ...] = ()  # entries of ``metrics.json``, one per finished stage
+    surface: dict[str, Any] | None = None  # surface metrics
+    events: Sequence[dict[str, Any]] = ()  # ``events.jsonl``
 
     @property
     def last(self) -> Mapping[str, Any]:
@@ -69,12 +55,7 @@ class RunRecord:
 def read_record(folder: Path) -> RunRecord:
     """Read what the report needs of a run folder.
 
-    Raises
-    ------
-    RunError
-        If the folder is not a run.
-    DataError
-        If a file is not JSON.
+    Raise RunError if the folder is not a run, DataError if a file is not JSON.
     """
     run = open_run(folder)
     metrics = run.metrics()
@@ -89,12 +70,7 @@ def read_record(folder: Path) -> RunRecord:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn errors about the content of a file into one DataError that names the file.
-
-    Raises
-    ------
-    DataError
-    """
+    """Turn errors about the content of a file into one DataError that names the file."""
     try:
         yield
     except DataError:

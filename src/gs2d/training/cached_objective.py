@@ -15,7 +15,7 @@ from gs2d.losses.base import Losses
 from gs2d.render.backends import Backend
 from gs2d.render.cpu_cached import CachedView
 from gs2d.render.types import RenderOutput
-from gs2d.training.objective import FullRender, Objective, Rendered
+from gs2d.training.objective import FullRender
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
 
@@ -45,7 +45,7 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int, 
 
 def choose_objective(
     whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int, processes: int = 1
-) -> Objective:
+) -> FullRender | CachedViews:
     """Return cached views if the stage allows them and enough fit in ``limit_bytes``, else ``whole``."""
     backend, views = whole.backend, len(whole.scene.train)
     fits = is_cacheable(whole.recipe, stage, backend=backend, views=views, processes=processes)
@@ -60,7 +60,6 @@ class CachedViews:
 
     Parameters
     ----------
-    whole : FullRender
     state : TrainState
         Geometry, opacity and the colours outside the group stay constant.
     stage : Stage
@@ -106,5 +105,5 @@ class CachedViews:
         unseen = color.new_empty(0)  # losses of such a stage read only the colour
         output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
         camera = self._whole.camera(state, index)  # constant in a stage that moves no splats
-        found = self._whole.differentiate(state, stage, iteration, Rendered(index, camera, output, leaves))
+        found = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
         return replace(found, rows=self.rows)

@@ -14,32 +14,29 @@ T = TypeVar("T")
 MIN_SHARE, MIN_SECONDS = 0.05, 60.0  # of a phase; time left is unknown until one of them has passed
 
 
-# -- events of the trainer, which the log keeps ------------------------------------------------------------------------
 @dataclass(frozen=True)
-class Initialised:
-    """The initial splats.
+class TrainingEvent:
+    """Base class of the events of the trainer, which the log keeps."""
 
-    Attributes
-    ----------
-    splats : int
-    source : str
-        "points" (of the scene), "sweep" (dense start), "depths" (points and known depths), "random", or "splats"
-        (passed by the caller).
-    dropped : int
-        Unusable points.
-    lacks : str
-        Reason why a recipe with a dense start has none here.
-    """
+    kind: ClassVar[str]
+
+
+# -- events of the trainer ---------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Initialised(TrainingEvent):
+    """The initial splats."""
 
     kind: ClassVar[str] = "initialised"
     splats: int
+    # "points" (of the scene), "sweep" (dense start), "depths" (points and known depths), "random", or "splats"
+    # (passed by the caller)
     source: str
-    dropped: int
-    lacks: str = ""
+    dropped: int  # unusable points
+    lacks: str = ""  # reason why a recipe with a dense start has none here
 
 
 @dataclass(frozen=True)
-class StageEntering:
+class StageEntering(TrainingEvent):
     """The entry actions of a stage are about to run; the splats are those of the previous stage."""
 
     kind: ClassVar[str] = "stage_entering"
@@ -49,7 +46,7 @@ class StageEntering:
 
 
 @dataclass(frozen=True)
-class Ranked:
+class Ranked(TrainingEvent):
     """Splats were ranked by colour error. ``threshold`` is the smallest E_i of the group, ``fraction`` its share."""
 
     kind: ClassVar[str] = "ranked"
@@ -61,7 +58,7 @@ class Ranked:
 
 
 @dataclass(frozen=True)
-class Cloned:
+class Cloned(TrainingEvent):
     """Splats were cloned in place."""
 
     kind: ClassVar[str] = "cloned"
@@ -73,7 +70,7 @@ class Cloned:
 
 
 @dataclass(frozen=True)
-class StageStarted:
+class StageStarted(TrainingEvent):
     """The entry actions of a stage are done; its first iteration is next."""
 
     kind: ClassVar[str] = "stage_started"
@@ -84,39 +81,25 @@ class StageStarted:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Figures of one iteration.
-
-    Attributes
-    ----------
-    losses : mapping
-        Weighted value of each active term; ``loss`` is their sum.
-    mean_opacity : float
-        Mean of o.
-    mean_k_a : float
-        Mean of K_a = s_u s_v (the paper's Eq. 7), world units^2.
-    lr : mapping
-        Learning rate of each trained attribute (means: world units).
-    sh_degree : int
-        Degree in training.
-    """
+class Progress(TrainingEvent):
+    """Figures of one iteration."""
 
     kind: ClassVar[str] = "progress"
     stage: str
     index: int
     iteration: int
     iterations: int
-    losses: Mapping[str, float]
+    losses: Mapping[str, float]  # weighted value of each active term; ``loss`` is their sum
     loss: float
     splats: int
-    mean_opacity: float
-    mean_k_a: float
-    lr: Mapping[str, float]
-    sh_degree: int
+    mean_opacity: float  # mean of o
+    mean_k_a: float  # mean of K_a = s_u s_v (the paper's Eq. 7), world units^2
+    lr: Mapping[str, float]  # learning rate of each trained attribute (means: world units)
+    sh_degree: int  # degree in training
 
 
 @dataclass(frozen=True)
-class Densified:
+class Densified(TrainingEvent):
     """Splats were cloned, split and pruned."""
 
     kind: ClassVar[str] = "densified"
@@ -130,7 +113,7 @@ class Densified:
 
 
 @dataclass(frozen=True)
-class OpacityLimited:
+class OpacityLimited(TrainingEvent):
     """Opacities were reset, or capped as in AbsGS."""
 
     kind: ClassVar[str] = "opacity_limited"
@@ -141,7 +124,7 @@ class OpacityLimited:
 
 
 @dataclass(frozen=True)
-class FloatersRemoved:
+class FloatersRemoved(TrainingEvent):
     """Splats that were proposed for removal, and that the training images do not need, were removed."""
 
     kind: ClassVar[str] = "floaters_removed"
@@ -152,7 +135,7 @@ class FloatersRemoved:
 
 
 @dataclass(frozen=True)
-class StageFinished:
+class StageFinished(TrainingEvent):
     """A stage is trained; the state points at the next one. ``unseen`` splats, in no training view, were removed."""
 
     kind: ClassVar[str] = "stage_finished"
@@ -166,19 +149,11 @@ class StageFinished:
 # -- events of the pipeline, which the console shows -------------------------------------------------------------------
 @dataclass(frozen=True)
 class Phase:
-    """A phase of ``total`` steps begins (0: unknown); the previous phase is over.
-
-    Attributes
-    ----------
-    name : str
-    total : int
-    done : int
-        Steps that an interrupted run had done.
-    """
+    """A phase of ``total`` steps begins (0: unknown); the previous phase is over."""
 
     name: str
     total: int
-    done: int = 0
+    done: int = 0  # steps that an interrupted run had done
 
     def seconds_left(self, done: int, elapsed: float) -> float | None:
         """Return the seconds until the phase ends, after ``elapsed`` seconds; None: too early to estimate."""
@@ -200,21 +175,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Notice:
-    """A line for the user.
-
-    Attributes
-    ----------
-    text : str
-    detail : bool
-        A decision that needs no action: printed with ``--verbose``, and logged in ``events.jsonl`` before training.
-    is_warning : bool
-        A part of the input is left out.
-    """
+    """A line for the user."""
 
     kind: ClassVar[str] = "notice"
     text: str
+    # A decision that needs no action: printed with ``--verbose``, and logged in ``events.jsonl`` before training.
     detail: bool = False
-    is_warning: bool = False
+    is_warning: bool = False  # a part of the input is left out
 
 
 @dataclass(frozen=True)
@@ -237,37 +204,14 @@ class StageScored:
 
 @dataclass(frozen=True)
 class NotMade:
-    """A file or a section of the result could not be made; the run continues.
+    """A file or a section of the result could not be made; the run continues."""
 
-    Attributes
-    ----------
-    what : str
-        File or section.
-    reason : str
-        One line.
-    command : str or None
-        Makes it; None: the same command with ``--resume``; "": nothing does.
-    error : Exception or None
-    """
-
-    what: str
-    reason: str
-    command: str | None = None
+    what: str  # file or section
+    reason: str  # one line
+    command: str | None = None  # makes it; None: the same command with ``--resume``; "": nothing does
     error: Exception | None = None
 
 
-TrainingEvent = (
-    Initialised
-    | StageEntering
-    | Ranked
-    | Cloned
-    | StageStarted
-    | Progress
-    | Densified
-    | OpacityLimited
-    | FloatersRemoved
-    | StageFinished
-)
 Event = TrainingEvent | Phase | Step | Notice | StageScored | NotMade
 OnEvent = Callable[[Event], None]
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol as Interface
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -20,11 +19,9 @@ from gs2d.losses.base import LossView, compute_losses, losses_of
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.training.learned.appearance import shown, shown_splats
-from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity
+from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity, shown, shown_splats
 from gs2d.training.learned.quantity import ImagePoints
-from gs2d.training.robust.dropout import dropout_rate, dropped_out, kept_splats
-from gs2d.training.robust.opaque import another_background
+from gs2d.training.robust.regularise import another_background, dropout_rate, dropped_out, kept_splats
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
 from gs2d.training.targets import Target, TargetSource, is_async
@@ -53,40 +50,6 @@ def visible_mask(splats: Splats, views: Sequence[View], settings: RasterSettings
     for view in views:
         seen |= rasterize(splats, view.camera, bare, backend=backend).radii > 0
     return seen
-
-
-@dataclass(frozen=True, eq=False)
-class Rendered:
-    """A rendered training view, to be compared with its image.
-
-    Attributes
-    ----------
-    index : int
-        Index of the training view.
-    camera : Camera
-    output : RenderOutput
-    leaves : mapping of attribute to Tensor
-        Tensors that ``output`` was rendered from.
-    """
-
-    index: int
-    camera: Camera
-    output: RenderOutput
-    leaves: Mapping[str, Tensor]
-
-
-class Objective(Interface):
-    """Computes the loss and the gradients of a view in a stage.
-
-    ``rows`` [M] int64: gradients may be of these rows alone; None: of all rows.
-    """
-
-    rows: Tensor | None
-
-    def evaluate(
-        self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
-    ) -> StepResult:
-        """Return loss and gradients of a training view; raise DivergedError if they are not finite."""
 
 
 class FullRender:
@@ -121,7 +84,7 @@ class FullRender:
         settings = replace(
             raster_settings(self.protocol, self.scene.extent, degree, self.recipe.mip_px),
             background=background or self.protocol.background,
-            with_distortion=bool(self.losses.needing("distortion", active)),
+            with_distortion=any("distortion" in self.losses[term].needs for term in active),
             with_transmittance_depth=False,
         )
         return settings.for_depths(*(term.depth or self.protocol.depth for term in active))
@@ -162,7 +125,7 @@ class FullRender:
         if self.frozen is not None and probe is not None:
             of_all = torch.cat([probe, probe.new_zeros(len(self.frozen), probe.shape[1])])
         output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)
-        found = self.differentiate(state, stage, iteration, Rendered(index, camera, output, dict(leaves.items())))
+        found = self.differentiate(state, stage, iteration, index, camera, output, dict(leaves.items()))
         signal = None if probe is None else _gradient(probe)
         return replace(found, signal=signal, radii=output.radii[: len(splats)])
 
@@ -186,19 +149,24 @@ class FullRender:
         given = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
         return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
 
-    def differentiate(self, state: TrainState, stage: Stage, iteration: int, rendered: Rendered) -> StepResult:
-        """Return the weighted losses of a rendered view, and the gradients of the leaves that the stage trains.
+    def differentiate(
+        self,
+        state: TrainState,
+        stage: Stage,
+        iteration: int,
+        index: int,
+        camera: Camera,
+        output: RenderOutput,
+        leaves: Mapping[str, Tensor],
+    ) -> StepResult:
+        """Return the weighted losses of training view ``index``, and the gradients of the leaves that the stage trains.
 
-        Colours are compared as the training image shows them. Learned quantities of the image and its camera get
-        gradients, too.
+        ``output`` was rendered from the ``leaves``, by attribute. Colours are compared as the training image shows
+        them. Learned quantities of the image and its camera get gradients, too.
 
-        Raises
-        ------
-        DivergedError
-            If a loss or a gradient is not finite. Not on a GPU, where reading a value waits for the device: there the
-            trainer checks losses and parameters together, before anything is reported or saved.
+        Raise DivergedError if a loss or a gradient is not finite. Not on a GPU, where reading a value waits for the
+        device: there the trainer checks losses and parameters together, before anything is reported or saved.
         """
-        index, camera, output, leaves = rendered.index, rendered.camera, rendered.output, rendered.leaves
         target = self.targets[index]
         at = ImagePoints(camera, target.silhouette, None if target.silhouette is None else self._background)
         numbers = self.learned.leaves(state.learned, index, camera, output.color)
@@ -252,13 +220,7 @@ def clipped_pixels(target: Target) -> Tensor:
 
 
 def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tensor]) -> dict[str, float]:
-    """Return the losses as numbers.
-
-    Raises
-    ------
-    DivergedError
-        If their sum is not finite.
-    """
+    """Return the losses as numbers; raise DivergedError if their sum is not finite."""
     values = {kind: float(value) for kind, value in losses.items()}
     if not math.isfinite(sum(values.values())):
         raise diverged(stage, iteration, f"the loss ({', '.join(f'{k} {v:g}' for k, v in values.items())})")

@@ -50,8 +50,6 @@ def adam_step(
 
     Parameters
     ----------
-    state : TrainState
-    stage : Stage
     gradients : mapping of attribute to Tensor
         Gradients of the attributes; rows outside a row group are not read. With ``rows``, of these rows alone.
     lr : mapping of attribute to float

@@ -3,16 +3,15 @@
 Each process holds the whole state. An iteration takes as many views as there are processes: each process renders one,
 the gradients are averaged, and all processes do the same update. Random numbers come from generators with the same
 state. Sums over all views are reduced over the processes, and process 0 decides for all. So the states stay identical
-bit by bit, which :meth:`ManyProcesses.check` verifies.
+bit by bit, which :meth:`ProcessGroup.check` verifies.
 
-The trainer uses one object: :data:`ONE_PROCESS`, which does nothing, or :class:`ManyProcesses` (``torch.distributed``
-with gloo on the CPU and NCCL on GPUs). Reasons: docs/notebook/processes.md.
+The processes are connected by ``torch.distributed``, with gloo on the CPU and NCCL on GPUs. Reasons:
+docs/notebook/processes.md.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 
 from gs2d.core.processes import ProcessRank
 from gs2d.errors import RunError
@@ -48,18 +47,27 @@ class LostContactError(RunError):
         self.told = told
 
 
-class OneProcess:
-    """Training in a single process: all collective operations do nothing.
+class ProcessGroup:
+    """The processes that train together: this one alone, or the default group of ``torch.distributed``.
+
+    In a single process, the collective operations do nothing. The group of several must be initialised.
+
+    Parameters
+    ----------
+    place : ProcessRank, optional
+        Without it, a single process.
+    hears : callable
+        Returns whether this process has received a request to stop.
 
     Attributes
     ----------
-    place : ProcessRank
     stop_asked : bool
         Whether any process had received a request to stop at the last :meth:`meet`.
     """
 
-    place = ProcessRank()
-    stop_asked = False
+    def __init__(self, place: ProcessRank | None = None, hears: Callable[[], bool] = lambda: False) -> None:
+        self.place, self.hears, self.stop_asked = place or ProcessRank(), hears, False
+        self._alone = self.place.size == 1
 
     @property
     def size(self) -> int:
@@ -71,16 +79,99 @@ class OneProcess:
         """Whether this process writes and prints."""
         return self.place.leads
 
+    # -- messages ------------------------------------------------------------------------------------------------------
+    def tell(self, facts: T) -> T:
+        """Return the value of process 0."""
+        if self._alone:
+            return facts
+        box: list[Any] = [facts]
+        with self.contact():
+            distributed.broadcast_object_list(box, src=0)
+        told: T = box[0]
+        return told
+
+    def announce(self) -> bool:
+        """Announce that this process ends and reports why; return False if another one was first."""
+        try:
+            store = self._store()
+            return store is None or store.add(FAILED, 1) == 1
+        except RuntimeError:  # the store ended with process 0
+            return False
+
+    @contextmanager
+    def contact(self) -> Iterator[None]:
+        """Turn a failed operation into one line: another process has ended."""
+        try:
+            yield
+        except RuntimeError as error:
+            if not isinstance(error, torch.OutOfMemoryError):
+                reason = " ".join(str(error).split())[:120]
+                raise LostContactError(
+                    f"process {self.place.rank} of {self.size} lost contact with another process, which has ended or "
+                    f"cannot be reached ({reason}); continue from the last checkpoint with --resume, with any number "
+                    "of processes",
+                    told=self._was_told(),
+                ) from error
+            raise
+
+    def _store(self) -> Any:
+        try:
+            return distributed.distributed_c10d._get_default_store()
+        except (RuntimeError, ValueError, AttributeError):
+            return None
+
+    def _was_told(self) -> bool:
+        if not self.leads:  # process 0 reports it; the store may have ended with it
+            return True
+        try:
+            store = self._store()
+            return store is not None and bool(store.check([FAILED]))
+        except RuntimeError:
+            return False
+
+    # -- the state -----------------------------------------------------------------------------------------------------
     def share(self, make: Callable[[], TrainState]) -> TrainState:
         """Return the state that ``make`` returns in process 0."""
-        return make()
+        if self._alone:
+            return make()
+        state = make() if self.leads else None
+        told = self.tell(None if state is None else state.state_dict())
+        return TrainState.from_state_dict(told or {}) if state is None else state
 
     def meet(self, state: TrainState) -> None:
-        """Wait for the other processes at the beginning of an iteration."""
+        """Wait for the other processes, while process 0 may score or save; share requests to stop."""
+        if self._alone:
+            return
+        own = torch.tensor([state.stage, state.step, len(state.splats), len(state.queue), int(self.hears())])
+        met = self._all(own)
+        self.stop_asked = bool(met[:, -1].any())
+        self._same(met[:, :-1], state)
 
     def check(self, state: TrainState) -> None:
-        """Raise RunError if the states of the processes differ."""
+        """Raise RunError if a hash of splats, moments, statistics, generator and learned quantities differs."""
+        if self._alone:
+            return
+        digest = hashlib.sha256(state.generator.get_state().numpy().tobytes() + repr(state.queue).encode())
+        for tensor in _tensors(state):
+            digest.update(repr((tuple(tensor.shape), _checksum(tensor))).encode())
+        self._same(self._all(torch.frombuffer(bytearray(digest.digest()), dtype=torch.int64)), state)
 
+    def _same(self, met: Tensor, state: TrainState) -> None:
+        differing = [rank for rank, own in enumerate(met.tolist()) if own != met[0].tolist()]
+        if differing:
+            raise RunError(
+                f"the states of processes 0 and {differing[0]} differ at iteration {state.step} of stage "
+                f"{state.stage + 1}; continue from the last checkpoint with --resume"
+            )
+
+    def _all(self, own: Tensor) -> Tensor:
+        """Gather a small host tensor [n] from all processes, [W, n]."""
+        met = [torch.empty_like(own) for _ in range(self.size)]
+        with self.contact():
+            distributed.all_gather(met, own)
+        return torch.stack(met)
+
+    # -- an iteration --------------------------------------------------------------------------------------------------
     def evaluate(
         self,
         turns: Sequence[Turn],
@@ -113,167 +204,17 @@ class OneProcess:
         sequence of mapping
             ``StepResult.learned`` of each view.
         """
-        result = one(turns[0])
-        return result, (result.learned,)
-
-    def gather(self, statistics: Statistics, result: StepResult, add: Callable[[Statistics, StepResult], Any]) -> None:
-        """Add the statistics of all views of the iteration in place; ``add`` adds those of one view."""
-        add(statistics, result)
-
-    def mean_losses(self, losses: Mapping[str, float | Tensor], views: int) -> Mapping[str, float | Tensor]:
-        """Return the mean of the losses over the views; a missing term counts 0."""
-        return losses
-
-    def part(self, things: Sequence[T]) -> Sequence[T]:
-        """Return the part of a sequence that this process works on."""
-        return things
-
-    def sum(self, tensor: Tensor) -> Tensor:
-        """Sum a tensor over the processes in place, and return it."""
-        return tensor
-
-    def any(self, mask: Tensor) -> Tensor:
-        """Return where a mask is True in any process."""
-        return mask
-
-    def decide(self, judge: Callable[[], Tensor], shape: tuple[int, ...], device: torch.device | str) -> Tensor:
-        """Return what ``judge`` returns in process 0: uint8 of a shape, on a device."""
-        return judge()
-
-
-ONE_PROCESS = OneProcess()
-
-
-class ManyProcesses(OneProcess):
-    """The processes of the default group of ``torch.distributed``, which must be initialised.
-
-    Parameters
-    ----------
-    place : ProcessRank
-    hears : callable
-        Returns whether this process has received a request to stop.
-    """
-
-    def __init__(self, place: ProcessRank, hears: Callable[[], bool] = lambda: False) -> None:
-        import torch.distributed as distributed
-
-        self._group = distributed
-        self.place, self.hears = place, hears
-
-    # -- messages ------------------------------------------------------------------------------------------------------
-    def tell(self, facts: T) -> T:
-        """Return the value of process 0."""
-        box: list[Any] = [facts]
-        with self.contact():
-            self._group.broadcast_object_list(box, src=0)
-        told: T = box[0]
-        return told
-
-    def announce(self) -> bool:
-        """Announce that this process ends and reports why; return False if another one was first."""
-        try:
-            store = self._store()
-            return store is None or store.add(FAILED, 1) == 1
-        except RuntimeError:  # the store ended with process 0
-            return False
-
-    @contextmanager
-    def contact(self) -> Iterator[None]:
-        """Turn a failed operation into one line: another process has ended."""
-        try:
-            yield
-        except RuntimeError as error:
-            if not isinstance(error, torch.OutOfMemoryError):
-                reason = " ".join(str(error).split())[:120]
-                raise LostContactError(
-                    f"process {self.place.rank} of {self.size} lost contact with another process, which has ended or "
-                    f"cannot be reached ({reason}); continue from the last checkpoint with --resume, with any number "
-                    "of processes",
-                    told=self._was_told(),
-                ) from error
-            raise
-
-    def _store(self) -> Any:
-        try:
-            return self._group.distributed_c10d._get_default_store()
-        except (RuntimeError, ValueError, AttributeError):
-            return None
-
-    def _was_told(self) -> bool:
-        if not self.leads:  # process 0 reports it; the store may have ended with it
-            return True
-        try:
-            store = self._store()
-            return store is not None and bool(store.check([FAILED]))
-        except RuntimeError:
-            return False
-
-    # -- the state -----------------------------------------------------------------------------------------------------
-    def share(self, make: Callable[[], TrainState]) -> TrainState:
-        """Return the state that ``make`` returns in process 0."""
-        state = make() if self.leads else None
-        file = io.BytesIO()
-        if state is not None:
-            torch.save(state.state_dict(), file)
-        size = torch.tensor([file.tell()])
-        with self.contact():
-            self._group.broadcast(size, src=0)
-        data = torch.frombuffer(file.getbuffer(), dtype=torch.uint8) if state is not None else torch.empty(0)
-        data = data if state is not None else torch.empty(int(size), dtype=torch.uint8)
-        with self.contact():
-            self._group.broadcast(data, src=0)
-        if state is not None:
-            return state
-        return TrainState.from_state_dict(torch.load(io.BytesIO(data.numpy().tobytes()), weights_only=True))
-
-    def meet(self, state: TrainState) -> None:
-        """Wait for the other processes, while process 0 may score or save; share requests to stop."""
-        own = torch.tensor([state.stage, state.step, len(state.splats), len(state.queue), int(self.hears())])
-        met = self._all(own)
-        self.stop_asked = bool(met[:, -1].any())
-        self._same(met[:, :-1], state)
-
-    def check(self, state: TrainState) -> None:
-        """Compare a hash of the splats, moments, statistics, generator and learned quantities."""
-        digest = hashlib.sha256(state.generator.get_state().numpy().tobytes() + repr(state.queue).encode())
-        for tensor in _tensors(state):
-            digest.update(repr((tuple(tensor.shape), _checksum(tensor))).encode())
-        self._same(self._all(torch.frombuffer(bytearray(digest.digest()), dtype=torch.int64)), state)
-
-    def _same(self, met: Tensor, state: TrainState) -> None:
-        differing = [rank for rank, own in enumerate(met.tolist()) if own != met[0].tolist()]
-        if differing:
-            raise RunError(
-                f"the states of processes 0 and {differing[0]} differ at iteration {state.step} of stage "
-                f"{state.stage + 1}; continue from the last checkpoint with --resume"
-            )
-
-    def _all(self, own: Tensor) -> Tensor:
-        """Gather a small host tensor [n] from all processes, [W, n]."""
-        met = [torch.empty_like(own) for _ in range(self.size)]
-        with self.contact():
-            self._group.all_gather(met, own)
-        return torch.stack(met)
-
-    # -- an iteration --------------------------------------------------------------------------------------------------
-    def evaluate(
-        self,
-        turns: Sequence[Turn],
-        one: Callable[[Turn], StepResult],
-        idle: Callable[[], StepResult],
-        *,
-        rows: Tensor | None,
-        learned: Mapping[str, tuple[int, ...]],
-    ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
-        """Return the gradients of the mean loss of some views; this process renders one of them."""
         rank = self.place.rank
+        if self._alone:
+            result = one(turns[0])
+            return result, (result.learned,)
         result = one(turns[rank]) if rank < len(turns) else idle()
         splats = dict(result.gradients)
         if rows is not None and result.rows is None:
             splats = {name: tensor[rows] for name, tensor in splats.items()}
         splats = {name: tensor.contiguous() for name, tensor in splats.items()}
         with self.contact():
-            sums = [self._group.all_reduce(splats[name], async_op=True) for name in sorted(splats)]
+            sums = [distributed.all_reduce(splats[name], async_op=True) for name in sorted(splats)]
             for work in sums:
                 work.wait()
         for tensor in splats.values():
@@ -295,41 +236,52 @@ class ManyProcesses(OneProcess):
         return found
 
     def gather(self, statistics: Statistics, result: StepResult, add: Callable[[Statistics, StepResult], Any]) -> None:
-        """Add the statistics of all views of the iteration in place."""
+        """Add the statistics of all views of the iteration in place; ``add`` adds those of one view."""
+        if self._alone:
+            add(statistics, result)
+            return
         own = {name: torch.zeros_like(tensor) for name, tensor in statistics.items()}
         add(own, result)
         for name in sorted(own):
             statistics[name].add_(self.sum(own[name]))
 
     def mean_losses(self, losses: Mapping[str, float | Tensor], views: int) -> Mapping[str, float | Tensor]:
-        """Return the mean of the losses over the views."""
+        """Return the mean of the losses over the views; a missing term counts 0."""
+        if self._alone:
+            return losses
         found: list[Any] = [None] * self.size
         with self.contact():
-            self._group.all_gather_object(found, {kind: float(value) for kind, value in losses.items()})
+            distributed.all_gather_object(found, {kind: float(value) for kind, value in losses.items()})
         kinds = dict.fromkeys(kind for one in found for kind in one)
         return {kind: sum(one.get(kind, 0.0) for one in found) / views for kind in kinds}
 
     # -- work on all views ---------------------------------------------------------------------------------------------
     def part(self, things: Sequence[T]) -> Sequence[T]:
-        """Return every W-th entry."""
-        return things[self.place.rank :: self.size]
+        """Return the part of a sequence that this process works on: every W-th entry."""
+        return things[self.place.rank :: self.place.size]
 
     def sum(self, tensor: Tensor) -> Tensor:
         """Sum a tensor over the processes in place, and return it."""
-        with self.contact():
-            self._group.all_reduce(tensor)
+        if not self._alone:
+            with self.contact():
+                distributed.all_reduce(tensor)
         return tensor
 
     def any(self, mask: Tensor) -> Tensor:
         """Return where a mask is True in any process."""
         return self.sum(mask.to(torch.int32)) > 0
 
-    def decide(self, judge: Callable[[], Tensor], shape: tuple[int, ...], device: torch.device | str) -> Tensor:
-        """Return the result of ``judge`` in process 0."""
-        found = judge() if self.leads else torch.empty(shape, dtype=torch.uint8, device=device)
+    def decide(self, judge: Callable[[], Tensor], like: Tensor) -> Tensor:
+        """Return what ``judge`` returns in process 0: uint8 of the shape and on the device of ``like``."""
+        if self._alone:
+            return judge()
+        found = judge() if self.leads else torch.empty_like(like, dtype=torch.uint8)
         with self.contact():
-            self._group.broadcast(found, src=0)
+            distributed.broadcast(found, src=0)
         return found
+
+
+ONE_PROCESS = ProcessGroup()
 
 
 def _tensors(state: TrainState) -> Iterator[Tensor]:

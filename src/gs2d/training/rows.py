@@ -33,7 +33,6 @@ def append_rows(
 
     Parameters
     ----------
-    state : TrainState
     splats : Splats
         M rows.
     groups : mapping of name to bool Tensor [M], optional
@@ -44,45 +43,43 @@ def append_rows(
     """
     groups = {} if groups is None else groups
     check_shapes({"means": (splats.means, "M 3")} | {f"group {k}": (mask, "M") for k, mask in groups.items()})
-    rows = _Rows(state, len(splats), keep)
-    added = dict(splats.items())
-    state.splats = Splats(**{name: rows.of(t.detach(), added[name].detach()) for name, t in state.splats.items()})
-    for moments in state.moments.values():
-        moments.mean = rows.of(moments.mean)
-        moments.square = rows.of(moments.square)
-    if state.statistics is not None:
-        state.statistics = {name: rows.of(tensor) for name, tensor in state.statistics.items()}
-    new_names = [name for name in groups if name not in state.groups]
-    nowhere = torch.zeros(rows.before if new_names else 0, dtype=torch.bool, device=state.splats.device)
-    old_groups = state.groups | dict.fromkeys(new_names, nowhere)
-    state.groups = {name: rows.of(group, groups.get(name)) for name, group in old_groups.items()}
+    before, added, kept = len(state.splats), len(splats), _kept(state, keep)
+    stay = before if kept is None else len(kept)
 
-
-class _Rows:
-    """Old rows that are kept, and the number of new rows."""
-
-    def __init__(self, state: TrainState, added: int, keep: Tensor | None) -> None:
-        self.before, self.added = len(state.splats), added
-        self.kept: Tensor | None = None  # [K] int64; None = all
-        if keep is not None:
-            check_shapes({"means": (state.splats.means, "N 3"), "mask": (keep, "N")})
-            if keep.dtype != torch.bool:
-                raise ShapeError(f"mask must be bool [N], got {keep.dtype}")
-            kept = keep.nonzero().squeeze(1)
-            self.kept = None if len(kept) == self.before else kept
-
-    def of(self, old: Tensor, new: Tensor | None = None) -> Tensor:
+    def rows_of(old: Tensor, new: Tensor | None = None) -> Tensor:
         """Return the kept rows of ``old``, followed by those of ``new`` or zeros."""
-        if self.kept is None and self.added == 0:
+        if kept is None and added == 0:
             return old
-        stay = self.before if self.kept is None else len(self.kept)
-        result = old.new_empty(stay + self.added, *old.shape[1:])
-        if self.kept is None:
+        result = old.new_empty(stay + added, *old.shape[1:])
+        if kept is None:
             result[:stay] = old
         else:
-            torch.index_select(old, 0, self.kept, out=result[:stay])
+            torch.index_select(old, 0, kept, out=result[:stay])
         result[stay:] = 0 if new is None else new
         return result
+
+    own = dict(splats.items())
+    state.splats = Splats(**{name: rows_of(t.detach(), own[name].detach()) for name, t in state.splats.items()})
+    for moments in state.moments.values():
+        moments.mean = rows_of(moments.mean)
+        moments.square = rows_of(moments.square)
+    if state.statistics is not None:
+        state.statistics = {name: rows_of(tensor) for name, tensor in state.statistics.items()}
+    new_names = [name for name in groups if name not in state.groups]
+    nowhere = torch.zeros(before if new_names else 0, dtype=torch.bool, device=state.splats.device)
+    old_groups = state.groups | dict.fromkeys(new_names, nowhere)
+    state.groups = {name: rows_of(group, groups.get(name)) for name, group in old_groups.items()}
+
+
+def _kept(state: TrainState, keep: Tensor | None) -> Tensor | None:
+    """Return the kept rows [K] int64; None: all."""
+    if keep is None:
+        return None
+    check_shapes({"means": (state.splats.means, "N 3"), "mask": (keep, "N")})
+    if keep.dtype != torch.bool:
+        raise ShapeError(f"mask must be bool [N], got {keep.dtype}")
+    kept = keep.nonzero().squeeze(1)
+    return None if len(kept) == len(keep) else kept
 
 
 def _no_rows(splats: Splats) -> Splats:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import torch
@@ -11,30 +11,21 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gs2d.core.checks import check_shapes
-from gs2d.core.splats import ATTRIBUTES, Splats
+from gs2d.core.splats import Splats
 from gs2d.errors import RunError, ShapeError
-from gs2d.training.learned_rows import LearnedRows
 
 FORMAT = 2  # of the state dict
 # Errors that reading a damaged state dict raises.
-_BROKEN = (LookupError, TypeError, AttributeError, RuntimeError, ValueError, ArithmeticError)
+_BROKEN = (LookupError, TypeError, AttributeError, RuntimeError, ValueError)
 
 
 @dataclass(eq=False)
 class Moments:
-    """Adam's moments of one attribute.
+    """Adam's moments of one attribute."""
 
-    Attributes
-    ----------
-    mean, square : Tensor, like the attribute
-        Running means of the gradient and of its square.
-    steps : int
-        Number of updates; kept when rows are appended or zeroed, as in the official code.
-    """
-
-    mean: Tensor
-    square: Tensor
-    steps: int = 0
+    mean: Tensor  # like the attribute: running mean of the gradient
+    square: Tensor  # running mean of its square
+    steps: int = 0  # number of updates; kept when rows are appended or zeroed, as in the official code
 
     @classmethod
     def zeros_like(cls, parameter: Tensor) -> Moments:
@@ -43,46 +34,84 @@ class Moments:
 
 
 @dataclass(eq=False)
+class LearnedRows:
+    """G rows of numbers. A row is updated when one of its images is trained on."""
+
+    values: Tensor  # [G, ...]: the numbers
+    mean: Tensor  # [G, ...]: running mean of the gradient
+    square: Tensor  # [G, ...]: running mean of its square
+    steps: list[int]  # number of updates of each row
+
+    @classmethod
+    def start(cls, values: Tensor) -> LearnedRows:
+        """Return rows of these values with zero moments."""
+        return cls(values, torch.zeros_like(values), torch.zeros_like(values), [0] * len(values))
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    @torch.no_grad()
+    def adam_step(
+        self,
+        row: int,
+        gradient: Tensor,
+        rate: float | Tensor,
+        *,
+        constants: tuple[float, float, float],
+        assign: Callable[[Tensor, Tensor], Any] = Tensor.copy_,
+    ) -> None:
+        """Update one row in place.
+
+        Parameters
+        ----------
+        gradient : Tensor
+            Gradient of the row.
+        rate : float or Tensor
+            Learning rate of all numbers of the row, or of each.
+        constants : 3 floats
+            Adam's beta1, beta2 and eps.
+        assign : callable
+            Writes new values into a tensor. The step is counted even if it writes nothing.
+        """
+        self.steps[row] += 1
+        count, (beta1, beta2, eps) = self.steps[row], constants
+        gradient = gradient.to(self.values)
+        mean = beta1 * self.mean[row] + (1 - beta1) * gradient
+        square = beta2 * self.square[row] + (1 - beta2) * gradient * gradient
+        scale = (square / (1 - beta2**count)).sqrt() + eps
+        values = self.values[row] - rate / (1 - beta1**count) * mean / scale
+        for target, new in ((self.values, values), (self.mean, mean), (self.square, square)):
+            assign(target[row], new)
+
+    def move_to(self, device: torch.device | str) -> None:
+        """Move all tensors to a device."""
+        self.values, self.mean, self.square = (t.to(device) for t in (self.values, self.mean, self.square))
+
+    def check(self, name: str) -> None:
+        """Raise ShapeError unless all tensors have the same shape, and each row has a count."""
+        tail = " ".join(["G", *map(str, self.values.shape[1:])])
+        tensors = {f"{name} values": self.values, f"{name} means": self.mean, f"{name} squares": self.square}
+        arrays = {key: (tensor, tail) for key, tensor in tensors.items()}
+        check_shapes({f"{name} steps": (torch.tensor(self.steps), "G")} | arrays)
+
+
+@dataclass(eq=False)
 class TrainState:
-    """Mutable state of a training. Only the functions of ``training.rows`` change N.
+    """Mutable state of a training. Only the functions of ``training.rows`` change N."""
 
-    Attributes
-    ----------
-    splats : Splats
-        Plain tensors without autograd history.
-    generator : torch.Generator
-        CPU generator of all random choices of training.
-    moments : dict of attribute to Moments
-        Moments of the attributes that the stage trains.
-    groups : dict of name to bool Tensor [N]
-        Row groups that entry actions wrote.
-    statistics : dict of name to Tensor [N, ...], or None
-        Statistics of the densifier; None in stages without one.
-    stage, step : int
-        Index of the stage, and its finished iterations.
-    entered : bool
-        Whether the entry actions of the stage are done.
-    queue : list of int
-        Remaining training views of this epoch; the last entry comes next.
-    learned : dict of name to LearnedRows
-        Learned quantities of images and cameras (``gs2d.training.learned``).
-    shine : Tensor [V, S, S] uint8, or None
-        How shiny the surface is in cells of the training views (``training.robust.shine``).
-    processes : list of (stage, step, count)
-        Number of processes from a stage and step on; empty for one process throughout.
-    """
-
-    splats: Splats
-    generator: torch.Generator
-    moments: dict[str, Moments] = field(default_factory=dict)
-    groups: dict[str, Tensor] = field(default_factory=dict)
-    statistics: dict[str, Tensor] | None = None
-    stage: int = 0
-    step: int = 0
-    entered: bool = False
-    queue: list[int] = field(default_factory=list)
-    learned: dict[str, LearnedRows] = field(default_factory=dict)
+    splats: Splats  # plain tensors without autograd history
+    generator: torch.Generator  # CPU generator of all random choices of training
+    moments: dict[str, Moments] = field(default_factory=dict)  # of the attributes that the stage trains
+    groups: dict[str, Tensor] = field(default_factory=dict)  # row groups that entry actions wrote, bool [N]
+    statistics: dict[str, Tensor] | None = None  # of the densifier, [N, ...]; None in stages without one
+    stage: int = 0  # index of the stage
+    step: int = 0  # its finished iterations
+    entered: bool = False  # whether the entry actions of the stage are done
+    queue: list[int] = field(default_factory=list)  # remaining training views of this epoch; the last entry comes next
+    learned: dict[str, LearnedRows] = field(default_factory=dict)  # quantities of images and cameras, by name
+    # (stage, step, count): number of processes from a stage and step on; empty for one process throughout.
     processes: list[tuple[int, int, int]] = field(default_factory=list)
+    # [V, S, S] uint8: how shiny the surface is in cells of the training views (``training.robust.shine``).
     shine: Tensor | None = None
 
     def bare(self, index: int, flatness: Tensor | None) -> Tensor | None:
@@ -105,61 +134,30 @@ class TrainState:
 
     def state_dict(self) -> dict[str, Any]:
         """Return a deep copy on the host, in tensors and plain Python (``torch.load(..., weights_only=True)``)."""
-        return {
-            "format": FORMAT,
-            "splats": {name: _copy(tensor) for name, tensor in self.splats.items()},
-            "moments": {
-                name: {"mean": _copy(m.mean), "square": _copy(m.square), "steps": m.steps}
-                for name, m in self.moments.items()
-            },
-            "groups": {name: _copy(mask) for name, mask in self.groups.items()},
-            "statistics": None
-            if self.statistics is None
-            else {name: _copy(tensor) for name, tensor in self.statistics.items()},
-            "stage": self.stage,
-            "step": self.step,
-            "entered": self.entered,
-            "queue": list(self.queue),
-            "generator": self.generator.get_state(),
-            "learned": {name: rows.state_dict() for name, rows in self.learned.items()},
-            "processes": [list(since) for since in self.processes],
-            "shine": None if self.shine is None else _copy(self.shine),
-        }
+        return {"format": FORMAT, **_plain(self), "generator": self.generator.get_state()}
 
     @classmethod
     def from_state_dict(cls, data: Mapping[str, Any]) -> TrainState:
         """Return the state of a :meth:`state_dict`; tensors are copied.
 
-        Raises
-        ------
-        RunError
-            If it is of another format, incomplete, or its tensors do not fit together.
+        Raise RunError if it is of another format, incomplete, or its tensors do not fit together.
         """
         found = data.get("format") if isinstance(data, Mapping) else None
         if found != FORMAT:
             raise RunError(f"checkpoint must be of format {FORMAT}, got {str(found)[:40]!r}; train again")
         try:
-            splats = Splats(**{name: data["splats"][name].clone() for name in ATTRIBUTES})
+            made = {entry.name: _plain(data[entry.name]) for entry in fields(cls)}
             generator = torch.Generator()
-            generator.set_state(data["generator"])
-            statistics, shine = data["statistics"], data["shine"]
-            state = cls(
-                splats,
-                generator,
-                {
-                    k: Moments(m["mean"].clone(), m["square"].clone(), int(m["steps"]))
-                    for k, m in data["moments"].items()
-                },
-                {name: mask.clone() for name, mask in data["groups"].items()},
-                None if statistics is None else {k: v.clone() for k, v in statistics.items()},
-                int(data["stage"]),
-                int(data["step"]),
-                bool(data["entered"]),
-                [int(index) for index in data["queue"]],
-                {name: LearnedRows.from_state_dict(rows) for name, rows in data["learned"].items()},
-                [(int(stage), int(step), int(count)) for stage, step, count in data["processes"]],
-                None if shine is None else shine.clone(),
-            )
+            generator.set_state(made["generator"])
+            objects = {
+                "splats": Splats(**made["splats"]),
+                "generator": generator,
+                "moments": {name: Moments(**moments) for name, moments in made["moments"].items()},
+                "learned": {name: LearnedRows(**rows) for name, rows in made["learned"].items()},
+                "entered": bool(made["entered"]),
+                "processes": [(stage, step, count) for stage, step, count in made["processes"]],
+            }
+            state = cls(**made | objects)
             state.check()
             numbers = dict(state.splats.items()) | {name: rows.values for name, rows in state.learned.items()}
             for name, tensor in numbers.items():
@@ -187,12 +185,8 @@ class TrainState:
     def check(self) -> None:
         """Check that all tensors have the same N and the expected types, and that counts are valid.
 
-        Raises
-        ------
-        ShapeError
-            If a tensor has another N or type.
-        RunError
-            If a count is negative, or moments belong to no attribute.
+        Raise ShapeError if a tensor has another N or type, RunError if a count is negative, or moments belong to no
+        attribute.
         """
         parameters = dict(self.splats.items())
         unknown = self.moments.keys() - parameters.keys()
@@ -221,14 +215,21 @@ class TrainState:
         self._check_counts()
 
     def _check_counts(self) -> None:
-        """Raise RunError for a count below zero."""
-        steps = [moments.steps for moments in self.moments.values()]
-        learned = [rows.steps for rows in self.learned.values()]
-        least = min([self.stage, self.step, *steps, *self.queue, *(count for counts in learned for count in counts)])
-        if least < 0:
-            raise RunError(f"counts of iterations and views must be 0 or more, got {least}; train again")
+        """Raise RunError for a count that is not a whole number, or below zero."""
+        counts = [self.stage, self.step, *self.queue, *(count for since in self.processes for count in since)]
+        counts += [moments.steps for moments in self.moments.values()]
+        counts += [steps for rows in self.learned.values() for steps in rows.steps]
+        wrong = [count for count in counts if not isinstance(count, int) or count < 0]
+        if wrong:
+            raise RunError(f"counts of iterations and views must be 0 or more, got {wrong[0]}; train again")
 
 
-def _copy(tensor: Tensor) -> Tensor:
-    """Return a copy in the host's memory."""
-    return tensor.detach().to("cpu", copy=True)
+def _plain(value: Any) -> Any:
+    """Return a copy in plain Python, with tensors in the host's memory; an object becomes a dict of its attributes."""
+    if isinstance(value, Tensor):
+        return value.detach().to("cpu", copy=True)
+    if is_dataclass(value):
+        return _plain(vars(value))
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value

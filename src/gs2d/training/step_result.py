@@ -10,26 +10,14 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
-    """Losses and gradients of one training view.
+    """Losses and gradients of one training view."""
 
-    Attributes
-    ----------
-    losses : mapping of kind to float or Tensor []
-        Weighted losses. On a GPU they are tensors, because reading them would wait for the device.
-    gradients : mapping of attribute to Tensor
-        Gradients of the trained attributes; with ``rows``, of these rows alone, in their order.
-    signal : Tensor [N, 2] or [N, 4], or None
-        Screen gradients, if a densifier gathers them.
-    radii : Tensor [N] px or None
-        None if the view was not projected.
-    rows : Tensor [M] int64 or None
-    learned : mapping of name to Tensor
-        Gradients of the learned quantities of the image and its camera (``gs2d.training.learned``).
-    """
-
+    # Weighted losses by kind. On a GPU they are tensors [], because reading them would wait for the device.
     losses: Mapping[str, float | Tensor]
+    # Gradients by attribute, of those that the stage trains; with ``rows``, of these rows alone, in their order.
     gradients: Mapping[str, Tensor]
-    signal: Tensor | None
-    radii: Tensor | None
-    rows: Tensor | None = None
+    signal: Tensor | None  # screen gradients [N, 2] or [N, 4], if a densifier gathers them
+    radii: Tensor | None  # [N] px; None if the view was not projected
+    rows: Tensor | None = None  # [M] int64
+    # Gradients of the learned quantities of the image and its camera (``gs2d.training.learned``), by name.
     learned: Mapping[str, Tensor] = field(default_factory=dict)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +15,8 @@ from gs2d.data.scene import Scene, View
 from gs2d.losses.formulas import flatness
 from gs2d.render.backends import Backend
 
-TARGET_BYTES = 1 << 28  # enough for all images of a small capture
+TARGET_BYTES = 1 << 28  # of float targets: enough for all images of a small capture
+DEVICE_BYTES = 1 << 31  # of images on a GPU
 # Fraction of the images that must fit, or none is kept: making a target from decoded bytes takes only a few ms.
 WORTH_KEEPING = 0.5
 PINNED_BYTES = 1 << 33
@@ -24,27 +24,14 @@ PINNED_BYTES = 1 << 33
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Expected rendering of a training view.
+    """Expected rendering of a training view."""
 
-    Attributes
-    ----------
-    image : Tensor [H, W, 3]
-        In [0, 1], over the background.
-    mask : Tensor [H, W] bool or None
-        False = ignore this pixel.
-    mean : Tensor [H, W, 3] or None
-        Local mean of the image for the native SSIM, of images that are kept.
-    silhouette : Tensor [H, W] or None
-        Alpha of the image in [0, 1], if it has an alpha channel and a loss needs it.
-    flatness : Tensor [H, W] uint8 or None
-        ``losses.formulas.flatness`` of the image, if a loss needs it.
-    """
-
-    image: Tensor
-    mask: Tensor | None
-    mean: Tensor | None
+    image: Tensor  # [H, W, 3] in [0, 1], over the background
+    mask: Tensor | None  # [H, W] bool; False = ignore this pixel
+    mean: Tensor | None  # [H, W, 3]: local mean of the image for the native SSIM, of images that are kept
+    # [H, W]: alpha of the image in [0, 1], if it has an alpha channel and a loss needs it.
     silhouette: Tensor | None = None
-    flatness: Tensor | None = None
+    flatness: Tensor | None = None  # [H, W] uint8: ``losses.formulas.flatness`` of the image, if a loss needs it
 
     @property
     def nbytes(self) -> int:
@@ -55,23 +42,12 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class ImageBytes:
-    """A decoded training image.
+    """A decoded training image."""
 
-    Attributes
-    ----------
-    image : Tensor [H, W, 3 or 4] uint8
-    mask : Tensor [H, W] bool or None
-        False = ignore this pixel.
-    valid : int
-        Number of pixels that count.
-    flatness : Tensor [H, W] uint8 or None
-        As of ``Target``.
-    """
-
-    image: Tensor
-    mask: Tensor | None
-    valid: int
-    flatness: Tensor | None = None
+    image: Tensor  # [H, W, 3 or 4] uint8
+    mask: Tensor | None  # [H, W] bool; False = ignore this pixel
+    valid: int  # number of pixels that count
+    flatness: Tensor | None = None  # [H, W] uint8, as of ``Target``
 
     def nbytes(self, place: str) -> int:
         """Return the bytes on the "device", or in "pinned" memory, where torch rounds up to powers of two."""
@@ -85,27 +61,13 @@ class ImageBytes:
         return ImageBytes(image, mask, self.valid, flat)
 
 
-class TargetSource(Protocol):
-    """Targets by the index of their training view."""
-
-    def __getitem__(self, index: int) -> Target: ...
-
-    def photograph(self, index: int) -> ImageBytes | None:
-        """Return the bytes of an image on the device of training; None if targets are kept as floats."""
-
-
 def is_async(device: torch.device) -> bool:
     """Return whether reading a tensor on this device makes the host wait."""
     return device.type != "cpu"
 
 
 def make_targets(
-    scene: Scene,
-    protocol: config.Protocol,
-    backend: Backend,
-    splats: Splats,
-    needs: Collection[str],
-    limit_bytes: int | None,
+    scene: Scene, protocol: config.Protocol, backend: Backend, splats: Splats, needs: Collection[str]
 ) -> TargetSource:
     """Return the targets of the training views of a scene, on the device of the splats.
 
@@ -114,9 +76,8 @@ def make_targets(
     views, background, device = scene.train, protocol.background, splats.device
     use_masks = protocol.use_mask_in_training
     if is_async(device):
-        limit = 1 << 31 if limit_bytes is None else limit_bytes
         pinned = 0 if scene.ahead else cache_bytes(PINNED_BYTES)
-        options = {"limit_bytes": limit, "pinned_bytes": pinned, "needs": needs}
+        options = {"limit_bytes": DEVICE_BYTES, "pinned_bytes": pinned, "needs": needs}
         return DeviceTargets(views, background, use_masks=use_masks, device=device, **options)  # type: ignore[arg-type]
     operations = backend.loss_operations(device)
     return Targets(
@@ -127,7 +88,7 @@ def make_targets(
         needs=needs,
         dtype=splats.dtype,
         device=device,
-        limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
+        limit_bytes=0 if scene.ahead else TARGET_BYTES,
     )
 
 
@@ -140,14 +101,10 @@ class Targets:
     ----------
     views : sequence of View
     background : 3 floats in [0, 1]
-    use_masks : bool
     mean : callable, optional
         Computes the local mean of an image, which is kept with it.
     needs : collection of str
         "silhouette" and "flatness", if they are needed.
-    dtype : torch.dtype
-    device : torch.device
-    limit_bytes : int
     """
 
     def __init__(
@@ -207,11 +164,6 @@ class DeviceTargets:
 
     Parameters
     ----------
-    views : sequence of View
-    background : 3 floats in [0, 1]
-    use_masks : bool
-    device : torch.device
-    limit_bytes, pinned_bytes : int
     needs : collection of str
         "flatness", if it is needed.
     pin : callable
@@ -225,7 +177,7 @@ class DeviceTargets:
         *,
         use_masks: bool,
         device: torch.device,
-        limit_bytes: int = 1 << 31,
+        limit_bytes: int = DEVICE_BYTES,
         pinned_bytes: int = PINNED_BYTES,
         needs: Collection[str] = (),
         pin: Callable[[Tensor], Tensor] = torch.Tensor.pin_memory,
@@ -288,3 +240,6 @@ class DeviceTargets:
             self._room[place] -= image.nbytes(place)
             return self._kept[index]
         return image
+
+
+TargetSource = Targets | DeviceTargets

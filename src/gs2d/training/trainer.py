@@ -14,6 +14,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from gs2d.config.actions import ACTIONS
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe, Stage, validate
 from gs2d.core.memory import trim
@@ -25,14 +26,13 @@ from gs2d.losses.base import losses_of
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
-from gs2d.training.actions.entry_action import StageEntry, action_of
-from gs2d.training.cached_objective import choose_objective
+from gs2d.training.actions.entry_action import EntryAction, StageEntry
+from gs2d.training.cached_objective import CachedViews, choose_objective
 from gs2d.training.densify.densifier import Densifier, Surroundings, densifier_of
-from gs2d.training.first_splats import FirstSplats
+from gs2d.training.first_splats import first_splats
 from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity
 from gs2d.training.objective import (
     FullRender,
-    Objective,
     check_losses,
     diverged,
     first_not_finite,
@@ -41,14 +41,14 @@ from gs2d.training.objective import (
     visible_mask,
 )
 from gs2d.training.optimizer import adam_step, begin_stage, lr_at
-from gs2d.training.parallel import ONE_PROCESS, OneProcess, Turn
+from gs2d.training.parallel import ONE_PROCESS, ProcessGroup, Turn
 from gs2d.training.resumable import check_resumable
-from gs2d.training.robust.opaque import is_opaque
+from gs2d.training.robust.regularise import is_opaque
 from gs2d.training.robust.robustness import Robustness
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
-from gs2d.training.targets import TargetSource, is_async, make_targets
+from gs2d.training.targets import is_async, make_targets
 from gs2d.training.whole_steps import WholeSteps
 
 __all__ = ["OnEvent", "Trainer", "TrainerOptions", "raster_settings"]
@@ -74,15 +74,13 @@ class TrainerOptions:
         Transforms of the training views, for a recipe with given exposures.
     progress_every : int
         Iterations between Progress events. The last iteration of a stage always sends one.
-    target_bytes : int or None
-        Memory for images: float tensors on the CPU (default 256 MiB), bytes on a GPU (default 2 GiB).
     stage2_cache_bytes : int
         Memory for cached views (cpu backend, stages that train only the colours of a row group); 0 = none. The first
         views that fit are cached. The result depends on it by rounding.
     dtype : torch.dtype
         Type of new splats.
-    processes : OneProcess
-        Processes that train together (``training.parallel.ManyProcesses``), each with its own Trainer of the same scene
+    processes : ProcessGroup
+        Processes that train together (``training.parallel.ProcessGroup``), each with its own Trainer of the same scene
         and recipe. An iteration of W processes takes W views and counts as W iterations: ``state.step`` counts views.
         Process 0 provides ``state``, ``init`` or the start for all.
     """
@@ -92,10 +90,9 @@ class TrainerOptions:
     within: Callable[[Tensor], Tensor] | None = None
     exposures: Tensor | None = None
     progress_every: int = 10
-    target_bytes: int | None = None
     stage2_cache_bytes: int = 1 << 30
     dtype: torch.dtype = torch.float32
-    processes: OneProcess = ONE_PROCESS
+    processes: ProcessGroup = ONE_PROCESS
 
 
 class Trainer:
@@ -166,20 +163,24 @@ class Trainer:
         self.learned.move_to(self.state.learned, self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
-        self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
-        self._actions = [[action_of(action, s.name) for action in s.on_enter] for s in self.recipe.stages]
+        around = (scene, self.settings, protocol.white, self._learner, processes)
+        self._densifiers = [densifier_of(s.densify, Surroundings(s.name, *around)) for s in self.recipe.stages]
+        self._actions: list[list[EntryAction]] = [
+            [ACTIONS.make(action.name, options=action.options, where=f"stage {s.name!r}: ") for action in s.on_enter]
+            for s in self.recipe.stages
+        ]
         self._check_shared()
-        self._objective: Objective | None = None  # of the current stage, from its first iteration on
-        self._whole_steps: WholeSteps | None = None  # also of the current stage
+        # Of the current stage, from its first iteration on:
+        self._objective: FullRender | CachedViews | None = None
+        self._whole_steps: WholeSteps | None = None
         self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
         needs = {need for _, loss in self._losses for need in loss.needs}
         self._needs_flatness = "flatness" in needs
         needs |= {"silhouette"} if is_opaque(self.recipe) or self.learned.changes_color else set()
-        self._targets: TargetSource = make_targets(
-            scene, protocol, self.backend, self.state.splats, needs, options.target_bytes
+        targets = make_targets(scene, protocol, self.backend, self.state.splats, needs)
+        self._whole = FullRender(
+            scene, self.recipe, protocol, self._learner, targets, frozen=self._frozen, learned=self.learned
         )
-        frozen, learner = self._frozen, self._learner
-        self._whole = FullRender(scene, self.recipe, protocol, learner, self._targets, frozen, self.learned)
 
     @property
     def splats(self) -> Splats:
@@ -222,7 +223,7 @@ class Trainer:
         """Run the entry actions of a stage and prepare its first iteration."""
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
-        self._objective = self._whole_steps = None
+        self._objective = None
         while self._pending:  # from the start
             self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
@@ -263,6 +264,7 @@ class Trainer:
         if self._objective is None:
             limit = self._options.stage2_cache_bytes // together.place.local_size
             self._objective = choose_objective(self._whole, state, stage, limit, together.size)
+            self._whole_steps = WholeSteps(self._whole, stage)
         reports = any(i % self._options.progress_every == 0 for i in iterations) or iteration == stage.iterations
         changes = any(self._changes(i) or self._robust.acts(stage, i) for i in iterations)
         result, happened = self._learner.iterate(
@@ -306,14 +308,22 @@ class Trainer:
         """Compute gradients, densify and update; return the result, or None for an iteration done by the backend."""
         state, objective, densifier = self.state, self._objective, self._densifiers[self.state.stage]
         assert objective is not None
-        iteration = turns[-1].iteration
-        if self._learner.takes_whole_steps() and self._learn_at_once(stage, turns, densifier):
+        assert self._whole_steps is not None
+        iteration, together = turns[-1].iteration, self.processes
+        at_once = together.size == 1 and objective is self._whole and self._learner.takes_whole_steps()
+        if at_once and self._whole_steps.learn(state, iteration, turns[0].index, densifier):
             self._robust.decay(state, stage, iteration, self._learner)
             return None, []
         # Of the iterations that are done in one step, densification sees the one in which it is due.
         due = next((turn.iteration for turn in turns[:-1] if self._changes(turn.iteration)), iteration)
         probe = None if densifier is None else densifier.before_backward(state, due)
-        result, of_views = self._evaluate(objective, stage, turns, probe)
+        result, of_views = together.evaluate(
+            turns,
+            lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
+            lambda: no_view(state, stage, probe),
+            rows=objective.rows,
+            learned=self.learned.shapes,
+        )
         happened = [] if densifier is None else list(densifier.after_backward(state, result, due))
         if not any(isinstance(event, events.Densified) for event in happened):
             limited = any(isinstance(event, events.OpacityLimited) for event in happened)
@@ -326,27 +336,6 @@ class Trainer:
             learning = self.learned.learning(state.stage, turn.iteration)
             self.learned.update(state.learned, turn.index, gradients, learning, self._learner)
         return result, happened
-
-    def _evaluate(
-        self, objective: Objective, stage: Stage, turns: Sequence[Turn], probe: Tensor | None
-    ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
-        """Return the gradients of the mean loss of some views, and the learned gradients of each view."""
-        state = self.state
-        return self.processes.evaluate(
-            turns,
-            lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
-            lambda: no_view(state, stage, probe),
-            rows=objective.rows,
-            learned=self.learned.shapes,
-        )
-
-    def _learn_at_once(self, stage: Stage, turns: Sequence[Turn], densifier: Densifier | None) -> bool:
-        """Let the backend do an iteration in one piece; return False if it cannot."""
-        if self.processes.size > 1:
-            return False
-        if self._whole_steps is None:
-            self._whole_steps = WholeSteps(self._whole, self._objective, stage)
-        return self._whole_steps.learn(self.state, turns[-1].iteration, turns[-1].index, densifier)
 
     def _rollback(self, stage: Stage, turns: Sequence[Turn]) -> None:
         """Undo the counters of an iteration that the device cancelled."""
@@ -363,29 +352,21 @@ class Trainer:
         for stage, densifier in zip(self.recipe.stages, self._densifiers, strict=True):
             if many == 1 or densifier is None:
                 continue
-            kind = type(densifier).__name__
-            if not densifier.shares_views:
-                raise RecipeError(
-                    f"stage {stage.name!r}: training in {many} processes needs a densifier with shares_views = True, "
-                    f"got {kind}; train in one process"
-                )
-            if type(densifier).changes is Densifier.changes:
-                raise RecipeError(
-                    f"stage {stage.name!r}: training in {many} processes needs a densifier that overrides "
-                    f"Densifier.changes, got {kind}; train in one process"
-                )
-
-    def _surroundings(self, stage: Stage) -> Surroundings:
-        """Return the context of the densifier of a stage."""
-        around = (stage.name, self.scene, self.settings, self.protocol.white, self._learner)
-        return Surroundings(*around, processes=self.processes)
+            kind = type(densifier)
+            if densifier.shares_views and kind.changes is not Densifier.changes:
+                continue
+            needs = "overrides Densifier.changes" if densifier.shares_views else "has shares_views = True"
+            raise RecipeError(
+                f"stage {stage.name!r}: training in {many} processes needs a densifier that {needs}, got "
+                f"{kind.__name__}; train in one process"
+            )
 
     def _first_state(self, init: Splats | None) -> TrainState:
         options = self._options
         generator = torch.Generator().manual_seed(self.recipe.seed)
         near = self.protocol.near_for(self.scene.extent)
-        start = FirstSplats(self.recipe, self._robust, near, generator, options.dtype)
-        splats, event = start.make(init, options.within)
+        start = self.recipe, self._robust, near, generator, options.dtype
+        splats, event = first_splats(*start, init, options.within)
         self._pending = [event]
         return TrainState(splats, generator, learned=self.learned.start(splats.means, {"exposure": options.exposures}))
 
@@ -400,7 +381,7 @@ class Trainer:
         state, index = self.state, self.state.stage
         unseen = self._drop_unseen(stage)
         state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
-        self._objective = self._whole_steps = None
+        self._objective = None
         self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats), unseen))
 
     def _drop_unseen(self, stage: Stage) -> int:

@@ -13,12 +13,10 @@ from gs2d.config.recipe import LossTerm, Stage
 from gs2d.render.types import RasterSettings
 from gs2d.render.whole_step import Learned, StepLosses, WholeStep
 from gs2d.training.densify.densifier import Densifier
-from gs2d.training.objective import FullRender, Objective, learning_rows
+from gs2d.training.objective import FullRender, learning_rows
 from gs2d.training.optimizer import lr_at
-from gs2d.training.robust.opaque import another_background
+from gs2d.training.robust.regularise import another_background
 from gs2d.training.state import TrainState
-
-__all__ = ["WholeSteps"]
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 
@@ -28,19 +26,12 @@ class WholeSteps:
 
     All active losses must allow it (``Loss.in_step``), and no quantity of images or cameras may be learned. Other
     iterations are done by :class:`~gs2d.training.objective.FullRender`.
-
-    Parameters
-    ----------
-    whole : FullRender
-    objective : Objective
-        Objective of the stage.
-    stage : Stage
     """
 
-    def __init__(self, whole: FullRender, objective: Objective | None, stage: Stage) -> None:
+    def __init__(self, whole: FullRender, stage: Stage) -> None:
         self._whole, self._stage = whole, stage
         self._terms = whole.protocol.resolve(stage.losses)
-        self._possible = objective is whole and whole.frozen is None and whole.drops(stage) == 0
+        self._possible = whole.frozen is None and whole.drops(stage) == 0
         self._settings: dict[object, RasterSettings] = {}  # by SH degree and background
         self._rows: tuple[tuple[Tensor, ...], Tensor | None] | None = None  # groups, and their union
 

@@ -22,21 +22,11 @@ MIN_AIM = 0.5  # cosine of the angle between optical axis and direction to the o
 
 @dataclass(frozen=True, eq=False)
 class PhotographedArc:
-    """Directions from the subject that were photographed, with a margin.
+    """Directions from the subject that were photographed, with a margin."""
 
-    Attributes
-    ----------
-    middle : ndarray [3]
-        Unit vector perpendicular to the up direction: the middle of the arc.
-    half : float, rad
-        Half of the angle of the arc; pi: all around.
-    low, high : float, rad
-        Limits of the elevation.
-    """
-
-    middle: np.ndarray
-    half: float
-    low: float
+    middle: np.ndarray  # [3]: unit vector perpendicular to the up direction: the middle of the arc
+    half: float  # rad: half of the angle of the arc; pi: all around
+    low: float  # rad: limits of the elevation
     high: float
 
 

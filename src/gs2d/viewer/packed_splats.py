@@ -28,26 +28,16 @@ WORD_BYTES = 32  # per splat, without the SH coefficients above degree 0
 
 @dataclass(frozen=True, eq=False)
 class PackedSplats:
-    """Splats as the page stores them, the most important ones first.
-
-    Attributes
-    ----------
-    count : int
-    degree : int
-        SH degree.
-    scales : list of 15 floats
-        Value of the 8-bit SH coefficient 127, for each coefficient of degree 1 to 3.
-    words : ndarray [N, 8] uint32
-        Per splat: mean relative to the page's origin (3 x float32), log scales (2 x float16), unit quaternion w x y z
-        (4 x int16, 32767 = 1), SH of degree 0 (3 x float16), opacity (float16; negative for spikes).
-    harmonics : ndarray [N, 16 * texels] int8
-        Other SH coefficients of each splat, as red, green, blue of each coefficient, padded to a multiple of 16 bytes.
-    """
+    """Splats as the page stores them, the most important ones first."""
 
     count: int
-    degree: int
-    scales: list[float]
+    degree: int  # SH degree
+    scales: list[float]  # [15] value of the 8-bit SH coefficient 127, for each coefficient of degree 1 to 3
+    # [N, 8] uint32, per splat: mean relative to the page's origin (3 x float32), log scales (2 x float16), unit
+    # quaternion w x y z (4 x int16, 32767 = 1), SH of degree 0 (3 x float16), opacity (float16; negative for spikes).
     words: np.ndarray
+    # [N, 16 * texels] int8: other SH coefficients of each splat, as red, green, blue of each coefficient, padded to a
+    # multiple of 16 bytes.
     harmonics: np.ndarray
 
     @property
@@ -80,9 +70,10 @@ def pack_splats(
 ) -> PackedSplats:
     """Pack splats for the page, without invisible ones (not finite, or opacity below ``alpha_min``).
 
+    Raise DataError if more than ``MAX_SPLATS`` are visible.
+
     Parameters
     ----------
-    splats : Splats
     origin : ndarray [3] world units
         Means are stored relative to it, which preserves their precision in float32.
     degree : int
@@ -91,11 +82,6 @@ def pack_splats(
     eyes : ndarray [V, 3] world units, optional
         Camera centres. Splats that are wider than the cameras can have seen them, such as needles that point at the
         cameras, are marked as spikes.
-
-    Raises
-    ------
-    DataError
-        If more than ``MAX_SPLATS`` are visible.
     """
     splats = splats.to("cpu")
     rows = _visible_rows(splats, alpha_min)

@@ -10,12 +10,11 @@ import contextlib
 import hmac
 import secrets
 import socket
-import socketserver
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
@@ -40,21 +39,11 @@ _HEADERS = {
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The answer to a request.
+    """The answer to a request."""
 
-    Attributes
-    ----------
-    kind : str
-        Content type.
-    parts : sequence of bytes-like
-        The body.
-    headers : mapping
-        Further headers.
-    """
-
-    kind: str
-    parts: Sequence[bytes | memoryview]
-    headers: Mapping[str, str] = field(default_factory=dict)
+    kind: str  # content type
+    parts: Sequence[bytes | memoryview]  # the body
+    headers: Mapping[str, str] = field(default_factory=dict)  # further headers
 
 
 Route = Callable[[Mapping[str, str]], Answer]
@@ -64,10 +53,7 @@ Route = Callable[[Mapping[str, str]], Answer]
 def free_port(port: int | None, *, option: str = "--port") -> int:
     """Return ``port`` if it is free; for None the first free port from 8080 on. ``option`` names it in messages.
 
-    Raises
-    ------
-    BackendError
-        If the port is out of range or in use.
+    Raise BackendError if the port is out of range or in use.
     """
     tried = [port] if port is not None else list(range(DEFAULT_PORT, DEFAULT_PORT + _TRIED_PORTS))
     reason = ""
@@ -88,10 +74,7 @@ def free_port(port: int | None, *, option: str = "--port") -> int:
 def number_in(arguments: Mapping[str, str], name: str, count: int) -> int:
     """Return an argument that must be an index below ``count``.
 
-    Raises
-    ------
-    DataError
-        If it is missing, not a number, or out of range.
+    Raise DataError if it is missing, not a number, or out of range.
     """
     text = arguments.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) < count):
@@ -157,11 +140,8 @@ class PageServer:
         self._thread.join(timeout=5)
 
 
-class _Server(socketserver.ThreadingMixIn, socketserver.TCPServer):
+class _Server(ThreadingHTTPServer):
     """A thread for each connection, up to a limit. Broken connections are not reported."""
-
-    daemon_threads = True
-    allow_reuse_address = True
 
     def __init__(self, page: PageServer) -> None:
         self.page = page

@@ -58,63 +58,29 @@ class WorldScale:
 
 @dataclass(frozen=True, eq=False)
 class PageScene:
-    """What a page shows, except splats, meshes and photographs.
-
-    Attributes
-    ----------
-    title : str
-    views : sequence of PageView
-        At least one.
-    settings : RasterSettings
-        The settings of the training.
-    focus : ndarray [3] world units
-        The point that the views look at. The page's coordinates are relative to it.
-    unit : float, world units
-        Typical distance between the views and ``focus``.
-    up : ndarray [3]
-        Unit vector.
-    subject : Subject or None
-        The page opens at the subject. None: it is guessed from the cameras.
-    world : WorldScale or None
-        If given, the page measures in metres, else in units of the capture.
-    is_photographed : bool
-        False: there are no photographs; ``views`` is the opening view only, and all directions are allowed.
-    """
+    """What a page shows, except splats, meshes and photographs."""
 
     title: str
-    views: Sequence[PageView]
-    settings: RasterSettings
-    focus: np.ndarray
-    unit: float
-    up: np.ndarray
-    subject: Subject | None = None
-    world: WorldScale | None = None
+    views: Sequence[PageView]  # at least one
+    settings: RasterSettings  # the settings of the training
+    focus: np.ndarray  # [3] world units: the point that the views look at, origin of the page's coordinates
+    unit: float  # world units: typical distance between the views and ``focus``
+    up: np.ndarray  # [3]: unit vector
+    subject: Subject | None = None  # the page opens at it; None: guessed from the cameras
+    world: WorldScale | None = None  # if given, the page measures in metres, else in units of the capture
+    # False: there are no photographs; ``views`` is the opening view only, and all directions are allowed.
     is_photographed: bool = True
 
 
 @dataclass(frozen=True)
 class PageOffer:
-    """The data that a page can request.
+    """The data that a page can request."""
 
-    Attributes
-    ----------
-    meshes : sequence of str
-        "mesh" (vertex colours) and "textured", as far as they exist.
-    photographs : bool
-        Whether there is a photograph for each view.
-    served : bool
-        Whether the data come from a server. False: they are embedded in the page.
-    stages : sequence of str
-        Stages whose splats a server offers.
-    live : bool
-        Whether the splats change.
-    """
-
-    meshes: Sequence[str] = ()
-    photographs: bool = False
-    served: bool = True
-    stages: Sequence[str] = ()
-    live: bool = False
+    meshes: Sequence[str] = ()  # "mesh" (vertex colours) and "textured", as far as they exist
+    photographs: bool = False  # whether there is a photograph for each view
+    served: bool = True  # whether the data come from a server; False: they are embedded in the page
+    stages: Sequence[str] = ()  # stages whose splats a server offers
+    live: bool = False  # whether the splats change
 
 
 def write_page(
@@ -126,24 +92,16 @@ def write_page(
     meshes: Mapping[str, bytes] | None = None,
     photographs: Sequence[bytes] = (),
 ) -> dict[str, Any]:
-    """Write the page with its data as one file.
+    """Write the page with its data as one file; return ``splats`` stored, ``sh_degree``, and ``bytes`` of the file.
 
     Parameters
     ----------
-    path : path
-    splats : Splats
-    scene : PageScene
     sh_degree : int
         Highest SH degree to store; degrees 3, 2, 1, 0 take 45, 24, 9 or 0 bytes per splat.
     meshes : mapping of str to bytes, optional
         ``meshing.web_mesh`` blocks, by the names of :class:`PageOffer`.
     photographs : sequence of bytes, optional
         JPEG files, one per view.
-
-    Returns
-    -------
-    dict
-        ``splats`` stored, ``sh_degree``, and ``bytes`` of the file.
     """
     meshes = meshes or {}
     packed = pack_for(scene, splats, sh_degree)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -72,7 +73,7 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     exact_in = [image.detach().double().requires_grad_() for image in images]
     how = NormalOptions(camera, valid, weights, edges == "camera", per_splat)
     value = CudaLosses(emulator).normal_consistency(*found_in, how)
-    function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
+    function = partial(reference.normal_consistency, per_splat=per_splat)
     exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
     if min(size) < 3:

@@ -168,13 +168,11 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
     monkeypatch.setattr(loop, "is_async", lambda device: True)
     monkeypatch.setattr(views, "is_async", lambda device: True)
     monkeypatch.setattr(targets, "is_async", lambda device: True)
-    trainer = Trainer(
-        scene, recipe, GENERIC, backend=emulated, options=TrainerOptions(progress_every=1000, target_bytes=1 << 20)
-    )
+    trainer = Trainer(scene, recipe, GENERIC, backend=emulated, options=TrainerOptions(progress_every=1000))
     in_stage(trainer, stage)
     trainer.step()
     for index in range(len(scene.train)):
-        trainer._targets[index]  # every image is loaded
+        trainer._whole.targets[index]  # every image is loaded
     with watched(monkeypatch) as seen:
         trainer.step()
         trainer.step()

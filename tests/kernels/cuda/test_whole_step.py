@@ -286,7 +286,7 @@ def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
     emulator: Emulator, scene: Scene, case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With images in host memory, if they do not fit on the device."""
-    recipe, given, count, options = brief(), scene, 6, {}
+    recipe, given, count = brief(), scene, 6
     if case == "object":
         recipe, given = of_object(recipe), masked(scene)
     elif case == "squares":
@@ -296,9 +296,9 @@ def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
     elif case == "long lists":
         monkeypatch.setattr(cuda_works, "SHORTEST_PIECE", 8)  # lists from 16 entries on are cut
     else:
-        options = {"target_bytes": 0}
-    parts, _ = trained(emulator, given, recipe, "torch", **options)
-    whole, some = trained(emulator, given, recipe, "launches", **options)
+        monkeypatch.setattr(targets, "DEVICE_BYTES", 0)
+    parts, _ = trained(emulator, given, recipe, "torch")
+    whole, some = trained(emulator, given, recipe, "launches")
     assert some == count
     assert same(parts, whole)
 

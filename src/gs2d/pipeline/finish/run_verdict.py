@@ -115,8 +115,8 @@ class Collector:
         if seen.split != "test" or self._observed is None:
             return measured
         points = self._observed.in_view(view.name, view.camera)
-        hidden = hidden_points(seen.output.depth("median").cpu().numpy(), points).hidden
-        return replace(measured, points=len(points.depth), hidden=hidden)
+        hidden = hidden_points(seen.output.depth("median").cpu().numpy(), points)
+        return replace(measured, points=len(points.depth), hidden=int(hidden.sum()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,8 @@ from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import LEARNED, POSES, SPLATS, RunFolder
 from gs2d.training.events import Notice, OnEvent
-from gs2d.training.learned.appearance import numbers_of, shown, unshown
 from gs2d.training.learned.image_exposure import exposure_gain
+from gs2d.training.learned.learned_table import numbers_of, shown, unshown
 from gs2d.training.learned.quantity import ImagePoints
 
 APPEARANCE = (

@@ -26,7 +26,7 @@ from gs2d.losses.base import losses_of
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points
 from gs2d.pipeline.prepare.options import Training, TrainOptions, check_choices
 from gs2d.training.events import Notice, OnEvent
-from gs2d.training.learned.point_gains import point_gains
+from gs2d.training.learned.point_gains import point_gains, spread
 from gs2d.training.robust.backdrop import find_backdrop
 from gs2d.training.robust.robustness import check_free_space
 
@@ -161,8 +161,8 @@ def robust_and_exposure(training: Training, scene: Scene, protocol: Protocol, on
     learned = training.learned
     exposure = "exposure" in learned
     if robust and not exposure and "auto" in learned and (found := point_gains(scene)) is not None:
-        exposure = found.spread >= DIFFERS
-        least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
+        exposure = spread(found) >= DIFFERS
+        least, most = found.mean(axis=1).min(), found.mean(axis=1).max()
         decision = "learned for each photograph" if exposure else "treated as equal (--learn exposure learns them)"
         on_event(
             Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times the mean; {decision}", detail=True)

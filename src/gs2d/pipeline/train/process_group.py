@@ -24,14 +24,14 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.run_logger import HeldSignals, progress_every
 from gs2d.training.events import Notice, OnEvent, ignore
-from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
+from gs2d.training.parallel import ONE_PROCESS, LostContactError, ProcessGroup
 from gs2d.training.trainer import Trainer, TrainerOptions
 
 PATIENCE = timedelta(days=7)  # the others wait while process 0 scores; a lost process is noticed by its connection
 
 
 @contextmanager
-def connected(backend: str) -> Iterator[OneProcess]:
+def connected(backend: str) -> Iterator[ProcessGroup]:
     """Connect to the other processes, if the environment defines any.
 
     Each process uses a GPU of its own, unless the requested backend is of the CPU. Raises BackendError if a process has
@@ -56,7 +56,7 @@ def connected(backend: str) -> Iterator[OneProcess]:
     torch.distributed.destroy_process_group()
 
 
-def _connect(place: ProcessRank, backend: str) -> ManyProcesses:
+def _connect(place: ProcessRank, backend: str) -> ProcessGroup:
     """Join the group of all processes, on a GPU of its own."""
     if not torch.distributed.is_available():
         raise BackendError("several processes need torch.distributed, which this torch does not have; use one")
@@ -71,12 +71,12 @@ def _connect(place: ProcessRank, backend: str) -> ManyProcesses:
         torch.cuda.set_device(place.local_rank)
     both = on_gpu and torch.distributed.is_nccl_available()
     torch.distributed.init_process_group("cpu:gloo,cuda:nccl" if both else "gloo", timeout=PATIENCE)
-    return ManyProcesses(place)
+    return ProcessGroup(place)
 
 
-def lead(loaded: LoadedRun, together: OneProcess, on_event: OnEvent) -> LoadedRun:
+def lead(loaded: LoadedRun, together: ProcessGroup, on_event: OnEvent) -> LoadedRun:
     """Send the run to the other processes, and report how many there are."""
-    if not isinstance(together, ManyProcesses):
+    if together.size == 1:
         return loaded
     rates = loaded.recipe.stages[0].lr
     rate = rates.for_views(together.size).sh0 / rates.sh0
@@ -85,7 +85,7 @@ def lead(loaded: LoadedRun, together: OneProcess, on_event: OnEvent) -> LoadedRu
     return replace(loaded, processes=together.size)
 
 
-def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
+def follow(options: TrainOptions, together: ProcessGroup) -> RunFolder:
     """Train along with process 0, to the last iteration.
 
     Raises RunError if this process would train something else, LostContactError if process 0 has ended.

@@ -36,7 +36,7 @@ from gs2d.pipeline.train.process_group import connected, follow, lead
 from gs2d.pipeline.train.resume import choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, TrainingEvent, ignore
-from gs2d.training.parallel import ManyProcesses, OneProcess
+from gs2d.training.parallel import ProcessGroup
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from gs2d.viewer.page_server import free_port
@@ -75,7 +75,7 @@ def train(
     with connected(options.backend) as together:
         use_threads(options.threads, together.place.local_size)
         use_memory(options.memory, together.place.local_size)
-        if isinstance(together, ManyProcesses) and not together.leads:
+        if not together.leads:
             return follow(options, together)
         check_places(options, allowed)
         heard: list[Event] = []
@@ -154,7 +154,7 @@ def train_stages(
     start: tuple[TrainState | None, float],
     on_event: OnEvent,
     collected: Collector | None,
-    together: OneProcess,
+    together: ProcessGroup,
     live: Live | None,
 ) -> Trained:
     """Train from ``start`` (:func:`choose_start`) to the end; return splats, and the scene with refined cameras.

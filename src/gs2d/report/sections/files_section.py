@@ -2,17 +2,7 @@
 
 from __future__ import annotations
 
-from gs2d.io.run_dir import (
-    EVENTS,
-    LEARNED,
-    MESH,
-    METRICS,
-    PAGE,
-    POSES,
-    RUN_JSON,
-    SPLATS,
-    TEXTURED,
-)
+from gs2d.io.run_dir import EVENTS, LEARNED, MESH, METRICS, PAGE, POSES, RUN_JSON, SPLATS, TEXTURED
 from gs2d.report.html_parts import macro
 from gs2d.report.run_record import RunRecord
 from gs2d.report.sections.section_registry import register_section

@@ -16,10 +16,7 @@ from gs2d.report.sections.section_registry import register_section
 def read_verdict(run: Path) -> dict[str, Any] | None:
     """Return the verdict in ``verdict.json`` of a run folder, or None where there is none.
 
-    Raises
-    ------
-    DataError, RunError
-        If the file is broken.
+    Raise DataError or RunError if the file is broken.
     """
     path = run / VERDICT
     if not path.exists():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -35,43 +35,21 @@ class RankByError(EntryAction):
         require(0 < percent <= 100, f"rank_by_error: top_percent must be in (0, 100], got {percent}")
         self.writes, self.top_percent, self.occlusion = writes, percent, occlusion
 
+    @torch.no_grad()
     def run(self, state: TrainState, entry: StageEntry) -> Sequence[events.TrainingEvent]:
-        """Rank the splats over all training views."""
-        total = total_errors(state.splats.means, entry.errors(self.occlusion), entry.processes.sum)
+        """Rank the splats by E_i over all training views (paper Eq. 8); raise DivergedError if one is not finite."""
+        total = torch.zeros(len(state.splats), dtype=torch.float64, device=state.splats.device)
+        for errors in entry.errors(self.occlusion):
+            total += errors
+        total = entry.processes.sum(total)
+        if not bool(torch.isfinite(total).all()):
+            raise DivergedError("ranking by error met NaN or infinity: a splat or a photograph is not finite")
         group = torch.zeros(len(total), dtype=torch.bool, device=total.device)
         group[worst(total, self.top_percent)] = True
         state.groups[self.writes] = group
         fraction = float(total[group].sum() / total.sum().clamp(min=1e-300))
         least = float(total[group].min())
         return (events.Ranked(entry.stage, self.writes, int(group.sum()), least, fraction),)
-
-
-@torch.no_grad()
-def total_errors(
-    means: Tensor, errors_by_view: Iterable[Tensor], combine: Callable[[Tensor], Tensor] = lambda total: total
-) -> Tensor:
-    """Return E_i of splats over all training views (paper Eq. 8), [N] float64.
-
-    Parameters
-    ----------
-    means : Tensor [N, 3]
-    errors_by_view : iterable of Tensor [N]
-        The inner sum of E_i for each training view.
-    combine : callable
-        Sums over several processes, each of which has the errors of some views.
-
-    Raises
-    ------
-    DivergedError
-        If an error is not finite.
-    """
-    total = torch.zeros(len(means), dtype=torch.float64, device=means.device)
-    for errors in errors_by_view:
-        total += errors
-    total = combine(total)
-    if not bool(torch.isfinite(total).all()):
-        raise DivergedError("ranking by error met NaN or infinity: a splat or a photograph is not finite")
-    return total
 
 
 def worst(errors: Tensor, top_percent: float) -> Tensor:

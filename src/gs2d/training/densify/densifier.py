@@ -10,42 +10,25 @@ from torch import Tensor
 from gs2d.config.densify import DENSIFIERS, Densify
 from gs2d.config.recipe import GradDensify
 from gs2d.data.scene import Scene
-from gs2d.errors import RecipeError
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
-from gs2d.training.parallel import ONE_PROCESS, OneProcess
+from gs2d.training.parallel import ONE_PROCESS, ProcessGroup
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
-
-__all__ = ["Densifier", "Surroundings", "densifier_of"]
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Context of a densifier.
+    """Context of a densifier."""
 
-    Attributes
-    ----------
-    stage : str
-        Name of the stage, for events.
-    scene : Scene
-        Sizes are compared with its ``extent`` (world units).
-    settings : RasterSettings
-    white : bool
-        Whether the background is white.
-    backend : Backend
-        Backend of the training; see its ``assign`` and ``accumulate``.
-    processes : OneProcess
-        Processes that train together. Statistics of views go through ``gather``, or ``part`` and ``sum``.
-    """
-
-    stage: str
-    scene: Scene
+    stage: str  # name of the stage, for events
+    scene: Scene  # sizes are compared with its ``extent`` (world units)
     settings: RasterSettings
-    white: bool
-    backend: Backend
-    processes: OneProcess = ONE_PROCESS
+    white: bool  # whether the background is white
+    backend: Backend  # of the training; see its ``assign`` and ``accumulate``
+    # Statistics of views go through ``gather``, or ``part`` and ``sum``.
+    processes: ProcessGroup = ONE_PROCESS
 
 
 class Densifier:
@@ -57,7 +40,6 @@ class Densifier:
 
     Parameters
     ----------
-    surroundings : Surroundings
     **options
         Options of the recipe (``Densify.options``); a wrong one raises TypeError.
 
@@ -109,22 +91,11 @@ class Densifier:
 
 
 def densifier_of(densify: GradDensify | Densify | None, surroundings: Surroundings) -> Densifier | None:
-    """Return the densifier of a stage.
-
-    Raises
-    ------
-    RecipeError
-        If its package cannot be imported, or it does not take its options.
-    """
+    """Return the densifier of a stage; raise RecipeError if its package or its options are wrong."""
     if densify is None:
         return None
     if isinstance(densify, GradDensify):
         densify = Densify("gradient", vars(densify))
-    try:
-        made: Densifier = DENSIFIERS.get(densify.name)(surroundings, **densify.options)
-    except TypeError as error:
-        raise RecipeError(
-            f"stage {surroundings.stage!r}: densifier {densify.name!r} does not take the options "
-            f"{dict(densify.options)}: {error}"
-        ) from error
+    where, options = f"stage {surroundings.stage!r}: ", densify.options
+    made: Densifier = DENSIFIERS.make(densify.name, surroundings, options=options, where=where)
     return made

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -36,7 +37,6 @@ class GradientDensifier(Densifier):
 
     Parameters
     ----------
-    surroundings : Surroundings
     **options
         Fields of GradDensify.
     """
@@ -139,37 +139,39 @@ def densify_and_prune(
 ) -> DensifyCounts:
     """Clone small splats and split large ones where the mean screen gradient is high, then prune; N changes.
 
+    Raise DivergedError if no splat would remain.
+
     Parameters
     ----------
     state : TrainState
         Its statistics are used and then zeroed.
-    densify : GradDensify
     iteration : int
         1-based, of the stage.
     extent : float, world units
         Scale that sizes are compared with.
     white : bool
         Whether the background is white, which adds an opacity reset.
-
-    Raises
-    ------
-    DivergedError
-        If no splat would remain.
     """
     splats, sizes = state.splats, _largest(state.splats.scales)
-    faint, large = _prunable(splats.opacities, sizes, densify, iteration=iteration, extent=extent, white=white)
+    prunable = partial(_prunable, densify=densify, iteration=iteration, extent=extent, white=white)
+    faint, large = prunable(splats.opacities, sizes)
     clone, split = _select(state, densify, sizes, extent, (faint, large))
     parents = split.nonzero().squeeze(1)  # [P]
     children = parents.repeat(CHILDREN)  # [C] all first children, then all second ones
     shrunk = splats.log_scales[children] - math.log(SHRINK)  # [C, 2]
-    ends = _prunable(
-        splats.opacities[children], _largest(shrunk.exp()), densify, iteration=iteration, extent=extent, white=white
-    )
+    faint_child, large_child = prunable(splats.opacities[children], _largest(shrunk.exp()))
     # random numbers for all children, also for those that are pruned
     means = points_in_plane(state, children)
-    keep, living = ~(split | faint | large), ~(ends[0] | ends[1])
+    keep, living = ~(split | faint | large), ~(faint_child | large_child)
     cloned = (clone & keep).nonzero().squeeze(1)
-    counts = _counts(clone, split, (faint, large), ends)
+    copies = (~split).long() + clone.long()  # [N] a clone is pruned with its original
+    figures = (  # a faint large splat counts as faint
+        clone.sum(),
+        split.sum(),
+        (copies * faint).sum() + faint_child.sum(),
+        (copies * (large & ~faint)).sum() + (large_child & ~faint_child).sum(),
+    )
+    counts = DensifyCounts(*torch.stack(figures).tolist())
     if int(keep.sum()) + len(cloned) + int(living.sum()) == 0:
         raise DivergedError(
             f"all {counts.pruned_by_opacity + counts.pruned_large} splats were pruned at iteration {iteration}: none "
@@ -198,11 +200,7 @@ def limit_opacity(state: TrainState, ceiling: float) -> None:
 
 
 def _select(
-    state: TrainState,
-    densify: GradDensify,
-    sizes: Tensor,
-    extent: float,
-    ends: tuple[Tensor, Tensor],
+    state: TrainState, densify: GradDensify, sizes: Tensor, extent: float, ends: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Return the rows to clone and to split, bool [N] each; ``ends`` are the too faint and too large rows."""
     statistics = state.statistics
@@ -215,21 +213,10 @@ def _select(
     )
     to_clone = small & (signed >= densify.grad_threshold)
     to_split = ~small & (for_split >= split_threshold)
-    if densify.max_splats is not None:
-        urgency = torch.where(small, signed / densify.grad_threshold, for_split / split_threshold)
-        to_clone, to_split = _within_budget(densify, to_clone, to_split, urgency, ends)
-    return to_clone, to_split
-
-
-def _within_budget(
-    densify: GradDensify,
-    to_clone: Tensor,
-    to_split: Tensor,
-    urgency: Tensor,
-    ends: tuple[Tensor, Tensor],
-) -> tuple[Tensor, Tensor]:
-    """Return the most urgent rows to clone and to split, so that at most ``max_splats`` remain."""
-    assert densify.max_splats is not None
+    if densify.max_splats is None:
+        return to_clone, to_split
+    # The most urgent ones, so that at most ``max_splats`` remain.
+    urgency = torch.where(small, signed / densify.grad_threshold, for_split / split_threshold)
     faint, large = ends
     stays = ~(faint | large)
     to_clone, to_split = to_clone & stays, to_split & ~faint  # splats that are pruned at once take no room
@@ -268,22 +255,3 @@ def _prunable(
     if not densify.culls_scale(iteration):
         large = torch.zeros_like(large)
     return faint, large
-
-
-def _counts(
-    clone: Tensor,
-    split: Tensor,
-    ends: tuple[Tensor, Tensor],
-    ends_of_children: tuple[Tensor, Tensor],
-) -> DensifyCounts:
-    """Count the changes of splats, clones and children; a faint large splat counts as faint."""
-    faint, large = ends
-    copies = (~split).long() + clone.long()  # [N] a clone is pruned with its original
-    child_faint, child_large = ends_of_children
-    figures = (
-        clone.sum(),
-        split.sum(),
-        (copies * faint).sum() + child_faint.sum(),
-        (copies * (large & ~faint)).sum() + (child_large & ~child_faint).sum(),
-    )
-    return DensifyCounts(*torch.stack(figures).tolist())

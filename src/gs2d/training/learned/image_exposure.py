@@ -49,7 +49,7 @@ class ImageExposure(LearnedQuantity):
         found = point_gains(self._scene) if self._initial == "points" else None
         if found is not None:
             for channel in range(3):
-                values[:, channel, channel] = torch.as_tensor(found.gains[:, channel] - 1)
+                values[:, channel, channel] = torch.as_tensor(found[:, channel] - 1)
         return values
 
     def numbers(self, values: Tensor, index: int) -> Tensor:

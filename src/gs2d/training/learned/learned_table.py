@@ -1,4 +1,4 @@
-"""The table of all learned quantities of a recipe, with one Adam."""
+"""All learned quantities of a recipe, with one Adam; colours of the scene as an image shows them."""
 
 from __future__ import annotations
 
@@ -7,26 +7,31 @@ from collections.abc import Collection, Mapping
 import torch
 from torch import Tensor
 
-from gs2d.config.quantities import QUANTITIES, Quantity
+from gs2d.config.quantities import QUANTITIES
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
-from gs2d.data.scene import Appearance, Scene
-from gs2d.errors import RecipeError, RunError
+from gs2d.core.sh import rgb_to_sh0, sh_to_rgb
+from gs2d.core.splats import Splats
+from gs2d.data.scene import Appearance, Scene, View
+from gs2d.errors import RunError
 from gs2d.kernels.torch_kernels import finite
 from gs2d.render.backends import Backend
-from gs2d.training.learned.quantity import LearnedQuantity
-from gs2d.training.learned_rows import LearnedRows
+from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
+from gs2d.training.state import LearnedRows
 
 Rows = Mapping[str, LearnedRows]
 """The rows of each quantity (``TrainState.learned``)."""
+Numbers = Mapping[str, Tensor]
+"""Numbers of a view by the name of the quantity."""
 
 
 class LearnedTable:
     """The learned quantities of a recipe on a scene. Their rows are in the training state.
 
+    The constructor raises RecipeError if the package of a quantity cannot be imported, or it does not take its options.
+
     Parameters
     ----------
-    recipe : Recipe
     scene : Scene
         Scene with the cameras of the capture, at full size.
 
@@ -34,16 +39,14 @@ class LearnedTable:
     ----------
     quantities : dict of name to LearnedQuantity
         In the order in which they are applied.
-
-    Raises
-    ------
-    RecipeError
-        If the package of a quantity cannot be imported, or a quantity does not take its options.
     """
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self._stages, self._scene = recipe.stages, scene
-        self.quantities = {name: _made(settings, scene) for name, settings in recipe.quantities.items()}
+        self.quantities: dict[str, LearnedQuantity] = {
+            name: QUANTITIES.make(name, settings, scene, options=settings.options)
+            for name, settings in recipe.quantities.items()
+        }
 
     @property
     def changes_color(self) -> bool:
@@ -59,10 +62,7 @@ class LearnedTable:
     def start(self, like: Tensor, given: Mapping[str, Tensor | None]) -> dict[str, LearnedRows]:
         """Return the initial rows; ``given`` are numbers of another training.
 
-        Raises
-        ------
-        RecipeError
-            If a quantity needs given numbers for each view and does not get them.
+        Raise RecipeError if a quantity needs given numbers for each view and does not get them.
         """
         found = {}
         for name, quantity in self.quantities.items():
@@ -126,7 +126,7 @@ class LearnedTable:
         return given
 
     def leaves(self, rows: Rows, index: int, camera: Camera, like: Tensor) -> dict[str, Tensor]:
-        """Return the tensors that ``appearance.shown`` applies to a rendering, as leaves of autograd."""
+        """Return the tensors that ``shown`` applies to a rendering, as leaves of autograd."""
         found = {
             name: quantity.leaf(rows[name].values, index, camera, like) for name, quantity in self.quantities.items()
         }
@@ -181,10 +181,45 @@ def _appearances(name: str, quantity: LearnedQuantity, values: Tensor, scene: Sc
     return {view: {name: found.detach().double().numpy()} for view, found in numbers.items()}
 
 
-def _made(settings: Quantity, scene: Scene) -> LearnedQuantity:
-    try:
-        made: LearnedQuantity = QUANTITIES.get(settings.name)(settings, scene, **settings.options)
-    except TypeError as error:
-        options = dict(settings.options)
-        raise RecipeError(f"quantity {settings.name!r} does not take the options {options}: {error}") from error
-    return made
+# -- colours --------------------------------------------------------------------------------------------------------
+def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | None = None) -> Tensor:
+    """Return colours [H, W, 3] of the scene as an image shows them, differentiable in colours and numbers.
+
+    Parameters
+    ----------
+    clipped : Tensor [H, W, 3] bool, optional
+        Clipped pixels of the image, which may be brighter in the scene: there the result is at most 1.
+    """
+    quantities = _ordered(numbers)
+    for quantity, found in quantities:
+        color = quantity.apply(color, found, at)
+    if clipped is None or not any(quantity.changes_color for quantity, _ in quantities):
+        return color
+    return torch.where(clipped & (color.detach() > 1), 1.0, color)
+
+
+@torch.no_grad()
+def shown_splats(splats: Splats, camera: Camera, numbers: Numbers, sh_degree: int) -> Splats:
+    """Return splats in the colours of an image, to be rendered at SH degree 0."""
+    center = torch.as_tensor(camera.center).to(splats.means)
+    directions = torch.nn.functional.normalize(splats.means - center, dim=1)
+    rgb = sh_to_rgb(splats.sh0, splats.shN, directions, min(sh_degree, splats.sh_degree))  # [N, 3]
+    seen = shown(rgb[None], numbers, ImagePoints(camera, points=splats.means))[0]
+    return Splats(**(dict(splats.items()) | {"sh0": rgb_to_sh0(seen)}))
+
+
+def unshown(color: Tensor, numbers: Numbers, at: ImagePoints) -> Tensor:
+    """Return colours [H, W, 3] of an image as the scene has them: the inverse of :func:`shown`."""
+    for quantity, found in reversed(_ordered(numbers)):
+        color = quantity.undo(color, found, at)
+    return color
+
+
+def numbers_of(view: View, like: Tensor) -> dict[str, Tensor]:
+    """Return the numbers of the appearance of a view, with the dtype and device of ``like``."""
+    return {name: torch.as_tensor(found).to(like) for name, found in view.appearance.items()}
+
+
+def _ordered(numbers: Numbers) -> list[tuple[type[LearnedQuantity], Tensor]]:
+    """Return quantities and numbers in the order of the registry, in which they are applied."""
+    return [(QUANTITIES.get(name), numbers[name]) for name in QUANTITIES if name in numbers]

@@ -6,8 +6,6 @@ fitted alternately. Robust weights suppress points whose colours change for othe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gs2d.data.prior_maps import ObservedPoints
@@ -21,24 +19,11 @@ MIN_COLORS = 30  # an image with fewer colours has gains of 1
 MIN_TRACK = 3
 
 
-@dataclass(frozen=True, eq=False)
-class PointGains:
-    """Gains of the training images of a scene.
+def point_gains(scene: Scene) -> np.ndarray | None:
+    """Return the gains of the training images and channels [V, 3]; their geometric mean over images is 1.
 
-    Attributes
-    ----------
-    gains : ndarray [V, 3]
-        Gain of each image and channel; the geometric mean over images is 1.
-    spread : float
-        Standard deviation over images of the logarithm of the mean gain of the channels.
+    None if the capture does not say which points the images show.
     """
-
-    gains: np.ndarray
-    spread: float
-
-
-def point_gains(scene: Scene) -> PointGains | None:
-    """Return the gains of the training images; None if the capture does not say which points they show."""
     observed = scene.observed(guessed=False)
     if observed is None:
         return None
@@ -71,10 +56,10 @@ def _colors(view: View, observed: ObservedPoints) -> tuple[np.ndarray, np.ndarra
     return rows[good], colors[good].astype(np.float64)
 
 
-def _fitted(views: np.ndarray, points: np.ndarray, values: np.ndarray, count: int) -> PointGains:
+def _fitted(views: np.ndarray, points: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Return the gains of ``count`` views from the logarithms [M, 3] of point colours."""
     if len(values) == 0:
-        return PointGains(np.ones((count, 3)), 0.0)
+        return np.ones((count, 3))
     _, points = np.unique(points, return_inverse=True)
     logs, weights = np.zeros((count, 3)), np.ones(len(values))
     for _ in range(ROUNDS):
@@ -85,7 +70,12 @@ def _fitted(views: np.ndarray, points: np.ndarray, values: np.ndarray, count: in
         logs -= logs.mean(axis=0)
         error = np.abs(left - logs[views]).mean(axis=1)
         weights = 1 / (1 + (error / OUTLIER) ** 2)
-    return PointGains(np.exp(logs), float(logs.mean(axis=1).std()))
+    return np.exp(logs)
+
+
+def spread(gains: np.ndarray) -> float:
+    """Return the standard deviation over images of the logarithm of the mean gain of the channels."""
+    return float(np.log(gains).mean(axis=1).std())
 
 
 def _means(groups: np.ndarray, values: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:

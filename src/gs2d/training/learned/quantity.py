@@ -22,38 +22,21 @@ MOST_CURVES = 6  # more lines in one plot cannot be told apart
 
 @dataclass
 class ImagePoints:
-    """Positions of the colours that a quantity changes: pixels of an image, or centres of splats.
-
-    Attributes
-    ----------
-    camera : Camera
-    coverage : Tensor [H, W], optional
-        Alpha of the image; None: 1 everywhere.
-    background : Tensor [3], optional
-        Background colour; given with ``coverage``.
-    points : Tensor [N, 3], optional
-        Centres of splats; the colours are then [1, N, 3]. None: the colours are an image [H, W, 3].
-    """
+    """Positions of the colours that a quantity changes: pixels of an image, or centres of splats."""
 
     camera: Camera
-    coverage: Tensor | None = None
-    background: Tensor | None = None
+    coverage: Tensor | None = None  # [H, W]: alpha of the image; None: 1 everywhere
+    background: Tensor | None = None  # [3]: background colour; given with ``coverage``
+    # [N, 3]: centres of splats; the colours are then [1, N, 3]. None: the colours are an image [H, W, 3].
     points: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class QuantityReport:
-    """Report of a learned quantity, for ``report.html``.
+    """Report of a learned quantity, for ``report.html``."""
 
-    Attributes
-    ----------
-    text : str
-        Sentences about the learned numbers.
-    curves : mapping of str to floats
-        Values by photograph, drawn in one plot; the keys are the legend.
-    """
-
-    text: str = ""
+    text: str = ""  # sentences about the learned numbers
+    # Values by photograph, drawn in one plot; the keys are the legend.
     curves: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
 

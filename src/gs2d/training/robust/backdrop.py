@@ -22,18 +22,10 @@ UNLIT = 0.1  # largest value of an unlit colour in every channel
 
 @dataclass(frozen=True)
 class Backdrop:
-    """Colour of the bare pixels of a capture.
+    """Colour of the bare pixels of a capture."""
 
-    Attributes
-    ----------
-    color : tuple of 3 floats
-        In [0, 1]: median of the pixels that are far from every sparse point.
-    alike : float
-        Fraction of these pixels that have nearly this colour.
-    """
-
-    color: tuple[float, float, float]
-    alike: float
+    color: tuple[float, float, float]  # in [0, 1]: median of the pixels that are far from every sparse point
+    alike: float  # fraction of these pixels that have nearly this colour
 
     @property
     def is_unlit(self) -> bool:

@@ -33,32 +33,19 @@ _UNKNOWN = float("inf")
 
 @dataclass(frozen=True, eq=False)
 class FreeView:
-    """Free space of one image.
+    """Free space of one image."""
 
-    Attributes
-    ----------
-    limit : Tensor [H, W] world units
-        Nearer space is free, because the image shows a surface behind it; 0 where the depth is unknown.
-    known : Tensor [H, W] world units
-        Depth of the surface that the image shows; infinite where unknown.
-    nearest : Tensor [H, W] world units
-        Where the depth is unknown, a depth nearer than anything known; 0 elsewhere.
-    radius : float, world units
-        Radius of a ball around the camera that is expected to be empty.
-    K, T : Tensor [3, 3], [4, 4]
-        Intrinsics; T_cam_world.
-    """
-
+    # [H, W] world units: nearer space is free, as the image shows a surface behind it; 0 where the depth is unknown.
     limit: Tensor
-    known: Tensor
-    nearest: Tensor
-    radius: float
-    K: Tensor
-    T: Tensor
+    known: Tensor  # [H, W] world units: depth of the surface that the image shows; infinite where unknown
+    nearest: Tensor  # [H, W] world units: where the depth is unknown, a depth nearer than anything known; 0 elsewhere
+    radius: float  # world units: radius of a ball around the camera that is expected to be empty
+    project: Tensor  # [3, 4]: projects a point p to pixel (x, y) and depth z: (x z, y z, z) = project (p, 1)
+    center: Tensor  # [3] world units: of the camera
 
     def to(self, device: torch.device | str) -> FreeView:
         """Return the view on a device."""
-        moved = {name: getattr(self, name).to(device) for name in ("limit", "known", "nearest", "K", "T")}
+        moved = {name: getattr(self, name).to(device) for name in ("limit", "known", "nearest", "project", "center")}
         return replace(self, **moved)
 
 
@@ -135,22 +122,17 @@ def _free_view(sweep: Sweep, index: int) -> FreeView:
     unknown = ~torch.isfinite(grown)
     limit = torch.where(unknown, 0.0, NEARER * grown)
     nearest = torch.where(unknown, NEARER * FLOOR * view.nearest, 0.0)
-    tensors = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in (view.K, view.T))
+    K, T = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in (view.K, view.T))
+    places = K @ T[:3], -T[:3, :3].T @ T[:3, 3]
     radius = BALL * FLOOR * view.nearest
-    return FreeView(limit.float(), torch.from_numpy(known).float(), nearest.float(), radius, *tensors)
+    return FreeView(limit.float(), torch.from_numpy(known).float(), nearest.float(), radius, *places)
 
 
 def _look(
-    view: FreeView,
-    ends: Tensor,
-    reach: Tensor,
-    limit: Tensor,
-    radius: float,
-    against: Tensor,
-    support: Tensor,
+    view: FreeView, ends: Tensor, reach: Tensor, limit: Tensor, radius: float, against: Tensor, support: Tensor
 ) -> None:
     """Count one image for each splat [N], natively if possible, else in torch."""
-    seen = SeenSpace(_projection(view), _center(view), limit, view.known, radius, 1 - NEARER)
+    seen = SeenSpace(view.project, view.center, limit, view.known, radius, 1 - NEARER)
     if not look_at_free_space(ends, reach, seen, against, support):
         look_at_free_space_reference(view, ends, limit, radius, against, support)
 
@@ -163,7 +145,7 @@ def look_at_free_space_reference(
     One is added to ``against`` [N] where an end of the splat is nearer than ``limit`` [H, W] or its centre is within
     ``radius`` of the camera, and to ``support`` [N] where its centre lies on the surface that the image shows.
     """
-    free = (ends[0] - _center(view)).norm(dim=1) < radius
+    free = (ends[0] - view.center).norm(dim=1) < radius
     for places in ends:
         z, inside, row, column = _seen(view, places)
         free |= inside & (z < limit[row, column])
@@ -173,18 +155,9 @@ def look_at_free_space_reference(
     support += inside & torch.isfinite(known) & ((z - known).abs() <= (1 - NEARER) * known)
 
 
-def _center(view: FreeView) -> Tensor:
-    return -view.T[:3, :3].T @ view.T[:3, 3]
-
-
-def _projection(view: FreeView) -> Tensor:
-    return view.K @ view.T[:3]
-
-
 def _seen(view: FreeView, places: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the depth of points [N, 3] in an image, whether they are inside, and their clipped rows and columns."""
-    project = _projection(view)
-    seen = places @ project[:, :3].T + project[:, 3]  # (x z, y z, z)
+    seen = places @ view.project[:, :3].T + view.project[:, 3]  # (x z, y z, z)
     z = seen[:, 2]
     front = z.clamp_min(1e-12)
     x, y = seen[:, 0] / front, seen[:, 1] / front

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -22,14 +22,13 @@ from gs2d.meshing.warped_ncc import GreyImage
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
-from gs2d.training.learned.appearance import shown
-from gs2d.training.learned.learned_table import LearnedTable
+from gs2d.training.learned.learned_table import LearnedTable, shown
 from gs2d.training.learned.quantity import ImagePoints
-from gs2d.training.parallel import ONE_PROCESS, OneProcess
+from gs2d.training.parallel import ONE_PROCESS, ProcessGroup
 from gs2d.training.robust import shine
 from gs2d.training.robust.backdrop import in_color
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
-from gs2d.training.robust.opaque import is_opaque
+from gs2d.training.robust.regularise import is_opaque
 from gs2d.training.robust.seen_area import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.rows import keep_rows
@@ -64,13 +63,11 @@ class Robustness:
 
     Parameters
     ----------
-    scene : Scene
-    recipe : Recipe
     raster : RasterSettings
         Rasterizer settings of training.
     backend : Backend
         Renders the trials.
-    processes : OneProcess
+    processes : ProcessGroup
         Processes that train together. Process 0 makes the start and the trials for all.
     frozen : Splats, optional
         Further splats of the scene, which are not trained.
@@ -95,7 +92,7 @@ class Robustness:
         recipe: Recipe,
         raster: RasterSettings,
         backend: Backend,
-        processes: OneProcess = ONE_PROCESS,
+        processes: ProcessGroup = ONE_PROCESS,
         frozen: Splats | None = None,
     ) -> None:
         self._processes, self._frozen = processes, frozen
@@ -147,7 +144,10 @@ class Robustness:
 
     def removes(self, stage: Stage, iteration: int) -> bool:
         """Return whether splats may be removed at the end of an iteration (1-based) of a stage."""
-        return looks_at_free_space(self._recipe, stage, iteration) or ends_part(self._recipe, stage, iteration)
+        removal = self._recipe.removal
+        if removal is None or not stage.moves_all:
+            return False
+        return iteration % removal.every == 0 or _ends_part(stage, iteration)
 
     def remove(self, state: TrainState, stage: Stage, iteration: int) -> list[events.TrainingEvent]:
         """Shrink splats that are too large for a known surface and remove floaters, if due."""
@@ -157,8 +157,8 @@ class Robustness:
         if LIMITED_FROM * stage.iterations <= iteration < stage.iterations:
             self._limit_scales(state)
         nobody = torch.zeros(state.splats.means.shape[0], dtype=torch.bool, device=state.splats.device)
-        known = nobody if ends_part(self._recipe, stage, iteration) else state.groups.get(MISSED, nobody)
-        verdict = self._decide(lambda: self._tried(state, stage, iteration, known), known)
+        known = nobody if _ends_part(stage, iteration) else state.groups.get(MISSED, nobody)
+        verdict = self._processes.decide(lambda: self._tried(state, stage, iteration, known), known)
         guilty = verdict == REMOVED
         state.groups[MISSED] = known | (verdict == NEEDED)
         removed = int(guilty.sum())
@@ -177,21 +177,17 @@ class Robustness:
         cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
         most = largest_log_scales(state.splats, cameras)
         large = (state.splats.log_scales > most).any(dim=1)
-        shrinks = self._decide(lambda: self._are_shown(state.splats, large), large).bool()
+        shrinks = self._processes.decide(lambda: self._are_shown(state.splats, large), large).bool()
         scales = state.splats.log_scales
         limits = torch.where(shrinks[:, None], most, most + math.log(LARGEST_ANYWHERE / LARGEST))
         self._backend.assign(scales, torch.minimum(scales, limits))
-
-    def _decide(self, judge: Callable[[], Tensor], like: Tensor) -> Tensor:
-        """Return what ``judge`` returns in process 0, uint8 of the shape and on the device of ``like``."""
-        return self._processes.decide(judge, tuple(like.shape), like.device)
 
     def find_shine(self, state: TrainState, stage: Stage, iteration: int) -> None:
         """Find out where photographs show shiny surface, if due; without the native library they count as matt."""
         if not self._looks_for_shine(stage, iteration):
             return
         found = torch.zeros((len(self.scene.train), shine.CELLS, shine.CELLS), dtype=torch.uint8)
-        state.shine = self._decide(partial(self._shine, state, found), found.to(state.splats.device))
+        state.shine = self._processes.decide(partial(self._shine, state, found), found.to(state.splats.device))
 
     def _looks_for_shine(self, stage: Stage, iteration: int) -> bool:
         return self._recipe.removal is not None and shine.is_due(stage, iteration)
@@ -221,7 +217,7 @@ class Robustness:
     def _tried(self, state: TrainState, stage: Stage, iteration: int, spared: Tensor) -> Tensor:
         """Propose splats that are not spared [N], and try them: NEEDED, REMOVED or 0, uint8 [N]."""
         splats = state.splats
-        last = ends_part(self._recipe, stage, iteration)
+        last = _ends_part(stage, iteration)
         against = self._proposed(state, splats, last=last).masked_fill(spared, 0)
         verdict = torch.zeros(len(splats), dtype=torch.uint8, device=splats.device)
         proposed = against > 0
@@ -299,13 +295,6 @@ class Robustness:
         backend.assign(logits, torch.where(fades, faded, logits))
 
 
-def looks_at_free_space(recipe: Recipe, stage: Stage, iteration: int) -> bool:
-    """Return whether splats in free space are proposed at the end of an iteration (1-based) of a stage."""
-    return recipe.removal is not None and stage.moves_all and iteration % recipe.removal.every == 0
-
-
-def ends_part(recipe: Recipe, stage: Stage, iteration: int) -> bool:
+def _ends_part(stage: Stage, iteration: int) -> bool:
     """Return whether one of ``PARTS`` of a stage ends with an iteration (1-based)."""
-    if recipe.removal is None or not stage.moves_all:
-        return False
     return iteration * PARTS // stage.iterations > (iteration - 1) * PARTS // stage.iterations

@@ -34,8 +34,9 @@ SIDE = 200  # px, longer side of the images that are rendered
 def votes_against_unseen(splats: Splats, cameras: Sequence[Camera], raster: RasterSettings, backend: Backend) -> Tensor:
     """Count the images that speak against large splats that hardly any image shows and that lie mostly outside them.
 
-    A large splat has one vote against it. If it is near cameras and would cover their images, each of these cameras is
-    a vote: one distant image that shows a corner of the splat does not outweigh them.
+    The result is [N] int32, 0 for all other splats. A large splat has one vote against it. If it is near cameras and
+    would cover their images, each of these cameras is a vote: one distant image that shows a corner of the splat does
+    not outweigh them.
 
     Parameters
     ----------
@@ -43,11 +44,6 @@ def votes_against_unseen(splats: Splats, cameras: Sequence[Camera], raster: Rast
         Cameras of the training images. Small renderings are enough for fractions.
     raster : RasterSettings
         Rasterizer settings of training.
-
-    Returns
-    -------
-    Tensor [N] int32
-        0 for all other splats.
     """
     most = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
     large = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)

@@ -20,29 +20,19 @@ from gs2d.core.splats import Splats
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.robust.dropout import dropped_out
+from gs2d.training.robust.regularise import dropped_out
 
 ENOUGH = 2  # images that keep a splat if they miss it, however many speak against it: wrong depths are correlated
 
 
 @dataclass(frozen=True, eq=False)
 class Witness:
-    """A downscaled training image of a trial.
-
-    Attributes
-    ----------
-    camera : Camera
-    color : Tensor [H, W, 3] in [0, 1]
-    usable : Tensor [H, W] bool
-        Pixels that count.
-    shown : callable
-        Returns the colours of a rendering [H, W, 3] as this image shows them.
-    """
+    """A downscaled training image of a trial."""
 
     camera: Camera
-    color: Tensor
-    usable: Tensor
-    shown: Callable[[Tensor], Tensor] = lambda color: color
+    color: Tensor  # [H, W, 3] in [0, 1]
+    usable: Tensor  # [H, W] bool: pixels that count
+    shown: Callable[[Tensor], Tensor] = lambda color: color  # colours of a rendering as this image shows them
 
 
 def missed(
@@ -54,7 +44,7 @@ def missed(
     *,
     stands_for: float = 1.0,
 ) -> Tensor:
-    """Return which of the proposed splats the training images miss.
+    """Return which of the proposed splats the training images miss, [N] bool.
 
     The number of images that miss a splat is the sum of their losses divided by the largest. Ten equal losses count as
     ten images; one large loss among small ones counts as little more than one.
@@ -68,13 +58,8 @@ def missed(
     witnesses : iterable of Witness
     raster : RasterSettings
         Rasterizer settings of training.
-    backend : Backend
     stands_for : float
         Training images for each witness.
-
-    Returns
-    -------
-    Tensor [N] bool
     """
     proposed = against > 0
     parts = {name: tensor.detach() for name, tensor in splats.items()}
