@@ -28,7 +28,7 @@ def main() -> None:
             words += ["--seed", str(numbers[0])]
         else:
             _signalled(*numbers)
-    pipeline.finish = lambda run, job, splats, *_, **__: write_splats(run.file("splats.ply"), splats)
+    pipeline.finish = lambda run, trained, *_, **__: write_splats(run.file("splats.ply"), trained.splats)
     gs2d.cli.main(words)
 
 
