@@ -16,14 +16,9 @@ NEARER = 0.95  # of a point's depth: a nearer surface occludes it; SfM depths ha
 def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NEARER) -> np.ndarray:
     """Return which points of a view are behind its rendered surface, [M] bool.
 
-    Parameters
-    ----------
-    depth : ndarray [H, W] world units
-        Rendered median depth; 0 without a surface.
-    points : PointsInView
-        From :meth:`gs2d.data.prior_maps.ObservedPoints.in_view`.
-    nearer : float
-        A point is hidden if the surface is nearer than this fraction of its depth.
+    ``depth`` [H, W] world units: rendered median depth; 0 without a surface. ``points``: from
+    :meth:`gs2d.data.prior_maps.ObservedPoints.in_view`. ``nearer``: a point is hidden if the surface is nearer than
+    this fraction of its depth.
     """
     columns, rows = np.floor(points.pixels).astype(np.int64).T
     surface = np.asarray(depth)[rows, columns]

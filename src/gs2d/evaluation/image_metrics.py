@@ -56,14 +56,8 @@ def quantise(image: Tensor) -> Tensor:
 def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Return the PSNR in dB: -10 log10 of the mean squared error over valid pixels and channels.
 
-    It is ``inf`` for equal images, ``nan`` if no pixel is valid.
-
-    Parameters
-    ----------
-    image, target : Tensor [H, W, 3]
-        In [0, 1]; the image is clamped to it.
-    mask : Tensor [H, W] bool, optional
-        False = ignore this pixel.
+    It is ``inf`` for equal images, ``nan`` if no pixel is valid. ``image``, ``target`` [H, W, 3] in [0, 1]; the image
+    is clamped to it. ``mask`` [H, W] bool: False = ignore this pixel.
     """
     check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
     squared = image.detach().clamp(0, 1).double()  # [H, W, 3]
@@ -120,14 +114,9 @@ def image_metrics(
 ) -> ImageMetrics:
     """Compute all image metrics of one view.
 
-    Parameters
-    ----------
-    image, target : Tensor [H, W, 3]
-        In [0, 1]; the image is clamped to it.
-    mask : Tensor [H, W] bool, optional
-        False = ignore this pixel. For LPIPS, the target replaces the image there, and the mean is over all pixels.
-    lpips : Lpips, optional
-        From ``evaluation.lpips.load_lpips``; without it LPIPS is null, with a remedy as the reason.
+    ``image``, ``target`` [H, W, 3] in [0, 1]; the image is clamped to it. ``mask`` [H, W] bool: False = ignore this
+    pixel. For LPIPS, the target replaces the image there, and the mean is over all pixels. ``lpips``: from
+    ``evaluation.lpips.load_lpips``; without it LPIPS is null, with a remedy as the reason.
     """
     rounded = quantise(image).to(image.dtype) / 255, quantise(target).to(target.dtype) / 255
     return ImageMetrics(

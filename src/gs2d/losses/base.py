@@ -302,11 +302,7 @@ def ssim(
 ) -> Tensor:
     """Mean SSIM [] over valid pixels, for evaluation (the loss "ssim" is 1 minus this).
 
-    Parameters
-    ----------
-    image, target : Tensor [H, W, 3]
-    mask : Tensor [H, W] bool, optional
-        False = ignore this pixel.
+    ``image``, ``target`` [H, W, 3]. ``mask`` [H, W] bool: False = ignore this pixel.
     """
     fused = _operations(backend, image.device)
     if fused is not None:

@@ -107,11 +107,8 @@ def aligned(map_: RelativeDepths, depth: Tensor, hit: Tensor) -> MetricDepth:
 def fit_line(x: Tensor, y: Tensor, weights: Tensor, rounds: int = FIT_ROUNDS) -> tuple[Tensor, Tensor]:
     """Fit y = scale x + shift by least squares with robust weights (Cauchy), and return scale and shift [].
 
-    Parameters
-    ----------
-    x, y, weights : Tensor [M]
-    rounds : int
-        Number of solutions. Each weighs errors in units of the mean absolute error of the previous one.
+    ``x``, ``y``, ``weights`` [M]. ``rounds``: number of solutions. Each weighs errors in units of the mean absolute
+    error of the previous one.
     """
     given, tiny = weights, torch.finfo(y.dtype).tiny
     scale = shift = y.new_zeros(())

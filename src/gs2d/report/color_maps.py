@@ -39,11 +39,8 @@ def depth_scale(steps: int) -> np.ndarray:
 def normal_image(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Return world normals as colours, (n + 1) / 2, over white, float32 [H, W, 3] in [0, 1].
 
-    Parameters
-    ----------
-    normal : ndarray [H, W, 3]
-        Normals of any length, as in ``RenderOutput.normal``; zero vectors are white.
-    alpha : ndarray [H, W]
+    ``normal`` [H, W, 3]: normals of any length, as in ``RenderOutput.normal``; zero vectors are white. ``alpha``
+    [H, W].
     """
     check_shapes({"normal": (normal, "H W 3"), "alpha": (alpha, "H W")})
     length = np.linalg.norm(normal, axis=2, keepdims=True)
@@ -68,13 +65,8 @@ def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
 def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
     """Return depth as colours from near (light) to far (dark), over white, float32 [H, W, 3] in [0, 1].
 
-    Parameters
-    ----------
-    depth : ndarray [H, W] world units
-        0 where nothing was hit.
-    alpha : ndarray [H, W]
-    limits : (near, far) world units, optional
-        Default: :func:`depth_limits` of this image.
+    ``depth`` [H, W] world units: 0 where nothing was hit. ``alpha`` [H, W]. ``limits``: near and far, world units;
+    default: :func:`depth_limits` of this image.
     """
     near, far = depth_limits(depth, alpha) if limits is None else limits
     cover = np.where((depth > 0) & np.isfinite(depth), np.clip(alpha, 0, 1), 0.0)[..., None]
@@ -85,14 +77,8 @@ def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float
 def error_image(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Return the mean absolute error over channels, from black at 0 to pale yellow at :data:`ERROR_TOP` and above.
 
-    The result is float32 [H, W, 3] in [0, 1].
-
-    Parameters
-    ----------
-    color, photo : ndarray [H, W, 3] in [0, 1]
-        The rendering is clipped to [0, 1].
-    mask : ndarray [H, W] bool, optional
-        False = this pixel is ignored: it shows grey.
+    The result is float32 [H, W, 3] in [0, 1]. ``color``, ``photo`` [H, W, 3] in [0, 1]: the rendering is clipped to
+    [0, 1]. ``mask`` [H, W] bool: False = this pixel is ignored: it shows grey.
     """
     check_shapes({"photo": (photo, "H W 3"), "color": (color, "H W 3")})
     error = np.abs(np.clip(color, 0, 1) - photo).mean(axis=2)
@@ -106,12 +92,8 @@ def error_image(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = 
 def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     """Return a photograph with hatching where ``valid`` is False, which undistortion left black.
 
-    Parameters
-    ----------
-    photo : ndarray [H, W, 3 or 4]
-        uint8, or floats in [0, 1]; the result has the same type.
-    valid : ndarray bool [H, W] or None
-        None: all pixels are valid.
+    ``photo`` [H, W, 3 or 4]: uint8, or floats in [0, 1]; the result has the same type. ``valid`` [H, W] bool: None: all
+    pixels are valid.
     """
     if valid is None:
         return photo
@@ -126,12 +108,8 @@ def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
 def highlight_image(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the high-error splats in magenta over a pale grey image, float32 [H, W, 3] in [0, 1].
 
-    Parameters
-    ----------
-    color : ndarray [H, W, 3] in [0, 1]
-        The rendering.
-    weight : ndarray [H, W] in [0, 1]
-        Sum of their blending weights in each pixel.
+    ``color`` [H, W, 3] in [0, 1]: the rendering. ``weight`` [H, W] in [0, 1]: sum of their blending weights in each
+    pixel.
     """
     check_shapes({"color": (color, "H W 3"), "weight": (weight, "H W")})
     grey = np.clip(color, 0, 1) @ np.array([0.2126, 0.7152, 0.0722])

@@ -80,10 +80,7 @@ def missing(text: str) -> Markup:
 def image_tag(image: np.ndarray, caption: str = "", *, alt: str, width: int = 360, full: str | None = None) -> Markup:
     """Return an image [H, W, 3 or 4] inline as JPEG, at most ``width`` px wide, over white.
 
-    Parameters
-    ----------
-    full : str, optional
-        Path of the full-size image relative to the report; shown when the image is enlarged.
+    ``full``: path of the full-size image relative to the report; shown when the image is enlarged.
     """
     return macro("macros.html", "figure", image, caption, alt, width, full)
 

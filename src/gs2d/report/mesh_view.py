@@ -41,14 +41,8 @@ class MeshView:
 def mesh_view(run: Path, cameras: Sequence[Camera]) -> MeshView | str:
     """Return the mesh of a run for the page, textured if there is a texture, or the reason why there is none.
 
-    Raise DataError if the mesh file is broken.
-
-    Parameters
-    ----------
-    run : Path
-        Run folder.
-    cameras : sequence of Camera
-        The orbit starts at the first camera. Empty: above the mesh, with the third axis up.
+    Raise DataError if the mesh file is broken. ``run``: run folder. ``cameras``: the orbit starts at the first camera.
+    Empty: above the mesh, with the third axis up.
     """
     path = run / MESH
     if not path.is_file():

@@ -78,10 +78,7 @@ def smoothed(values: np.ndarray, count: int = 9) -> np.ndarray:
 def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dict[str, str]:
     """Return SVG by title; figures without data are left out.
 
-    Parameters
-    ----------
-    stage_psnr : mapping of stage name to PSNR at its end, dB
-        Scores of the ``split`` views; drawn as points.
+    ``stage_psnr``: PSNR at the end of each stage, dB: scores of the ``split`` views; drawn as points.
     """
     drawn: dict[str, str] = {}
     terms = sorted(name for name in history.series if name.startswith("loss/"))

@@ -24,14 +24,8 @@ def write_report(run: Path, *, on_failure: OnFailure | None = None) -> Path:
     """Write ``report.html`` into a run folder, and return its path.
 
     Raise RunError if the folder is not a run, DataError if ``run.json``, ``metrics.json`` or ``events.jsonl`` is
-    broken, DiskError if the report cannot be written.
-
-    Parameters
-    ----------
-    run : Path
-        A run folder, finished or not.
-    on_failure : callable, optional
-        Receives the name and the error of each part that fails; the report shows the error in its place.
+    broken, DiskError if the report cannot be written. ``run``: a run folder, finished or not. ``on_failure``: receives
+    the name and the error of each part that fails; the report shows the error in its place.
     """
     record, guard = read_record(run), Guard(on_failure)
     body = [first_screen(record, guard), *_sections(record, guard)]

@@ -58,16 +58,9 @@ def choose_objective(
 class CachedViews:
     """Caches the first training views that fit in ``limit_bytes``; ``whole`` evaluates the others.
 
-    Parameters
-    ----------
-    state : TrainState
-        Geometry, opacity and the colours outside the group stay constant.
-    stage : Stage
-        A stage for which :func:`is_cacheable` is true.
-    limit_bytes : int
-        Limit for all cached views together.
-    least : float
-        If fewer views of the size of the first would fit, none is cached.
+    ``state``: geometry, opacity and the colours outside the group stay constant. ``stage``: a stage for which
+    :func:`is_cacheable` is true. ``limit_bytes``: limit for all cached views together. ``least``: if fewer views of the
+    size of the first would fit, none is cached.
 
     Attributes
     ----------

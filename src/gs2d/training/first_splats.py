@@ -28,16 +28,9 @@ def first_splats(
 ) -> tuple[Splats, events.Initialised]:
     """Return the first splats, and the event that reports them.
 
-    Parameters
-    ----------
-    robust : Robustness
-        Dense start of the recipe, with the scene that holds its points.
-    near : float, world units
-        Points nearer to a camera are dropped.
-    init : Splats, optional
-        Splats to start from, unless a dense start finds enough others.
-    within : callable, optional
-        Returns which points [M, 3] belong to the trained part of the scene, [M] bool.
+    ``robust``: dense start of the recipe, with the scene that holds its points. ``near`` (world units): points nearer
+    to a camera are dropped. ``init``: splats to start from, unless a dense start finds enough others. ``within``:
+    returns which points [M, 3] belong to the trained part of the scene, [M] bool.
     """
     if init is None or robust.starts_densely:
         start = with_known_points(robust.scene, recipe)

@@ -48,20 +48,11 @@ def adam_step(
 ) -> None:
     """Update the rows and attributes that the stage trains, in place.
 
-    Parameters
-    ----------
-    gradients : mapping of attribute to Tensor
-        Gradients of the attributes; rows outside a row group are not read. With ``rows``, of these rows alone.
-    lr : mapping of attribute to float
-    backend : Backend
-        By default plain torch.
-    skip : collection of str
-        Attributes that are not updated.
-    rows : Tensor [M] int64, optional
-        Rows of the group that the stage trains, if the gradients are restricted to them.
-    views : int
-        Number of views that the gradients average. Betas and eps are those of ``LearningRates.for_views``. Steps are
-        counted in views, so that the bias correction does not depend on the number of views.
+    ``gradients``: gradients of the attributes; rows outside a row group are not read. With ``rows``, of these rows
+    alone. ``backend``: by default plain torch. ``skip``: attributes that are not updated. ``rows`` [M] int64: rows of
+    the group that the stage trains, if the gradients are restricted to them. ``views``: number of views that the
+    gradients average. Betas and eps are those of ``LearningRates.for_views``. Steps are counted in views, so that the
+    bias correction does not depend on the number of views.
     """
     rates, updates = stage.lr.for_views(views), []
     for name, parameter in state.splats.items():

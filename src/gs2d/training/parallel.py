@@ -183,18 +183,9 @@ class ProcessGroup:
     ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
         """Return the gradients of the mean loss of some views, and the learned gradients of each view.
 
-        Parameters
-        ----------
-        turns : sequence of Turn
-            At most one for each process.
-        one : callable
-            Returns loss and gradients of one view.
-        idle : callable
-            Returns the result of a process without a view: zeros.
-        rows : Tensor [M] int64, or None
-            Rows that the gradients of splats are restricted to.
-        learned : mapping of name to shape
-            Shape of a row of each learned quantity.
+        ``turns``: at most one for each process. ``one``: returns loss and gradients of one view. ``idle``: returns the
+        result of a process without a view: zeros. ``rows`` [M] int64: rows that the gradients of splats are restricted
+        to. ``learned``: shape of a row of each learned quantity.
 
         Returns
         -------

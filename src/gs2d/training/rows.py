@@ -31,15 +31,9 @@ def append_rows(
 ) -> None:
     """Append M splats with zero moments and statistics.
 
-    Parameters
-    ----------
-    splats : Splats
-        M rows.
-    groups : mapping of name to bool Tensor [M], optional
-        Membership of the new rows; False in groups of the state that are not named. A new name becomes a group without
-        old rows.
-    keep : Tensor [N] bool, optional
-        Drop the old rows where it is False, in the same pass.
+    ``splats``: M rows. ``groups`` [M] bool: membership of the new rows; False in groups of the state that are not
+    named. A new name becomes a group without old rows. ``keep`` [N] bool: drop the old rows where it is False, in the
+    same pass.
     """
     groups = {} if groups is None else groups
     check_shapes({"means": (splats.means, "M 3")} | {f"group {k}": (mask, "M") for k, mask in groups.items()})

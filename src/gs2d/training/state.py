@@ -62,16 +62,9 @@ class LearnedRows:
     ) -> None:
         """Update one row in place.
 
-        Parameters
-        ----------
-        gradient : Tensor
-            Gradient of the row.
-        rate : float or Tensor
-            Learning rate of all numbers of the row, or of each.
-        constants : 3 floats
-            Adam's beta1, beta2 and eps.
-        assign : callable
-            Writes new values into a tensor. The step is counted even if it writes nothing.
+        ``gradient``: gradient of the row. ``rate``: learning rate of all numbers of the row, or of each. ``constants``
+        (3 floats): Adam's beta1, beta2 and eps. ``assign``: writes new values into a tensor. The step is counted even
+        if it writes nothing.
         """
         self.steps[row] += 1
         count, (beta1, beta2, eps) = self.steps[row], constants

@@ -95,16 +95,9 @@ def make_targets(
 class Targets:
     """Targets as float tensors. The first ones that fit in ``limit_bytes`` are kept, unless they are few.
 
-    Nothing is evicted: views come in shuffled epochs, so the least recently used one is needed next.
-
-    Parameters
-    ----------
-    views : sequence of View
-    background : 3 floats in [0, 1]
-    mean : callable, optional
-        Computes the local mean of an image, which is kept with it.
-    needs : collection of str
-        "silhouette" and "flatness", if they are needed.
+    Nothing is evicted: views come in shuffled epochs, so the least recently used one is needed next. ``background`` is
+    in [0, 1]. ``mean``: computes the local mean of an image, which is kept with it. ``needs``: "silhouette" and
+    "flatness", if they are needed.
     """
 
     def __init__(
@@ -161,13 +154,7 @@ class DeviceTargets:
 
     The first images that fit in ``limit_bytes`` stay on the device. The next ones, up to ``pinned_bytes`` or what the
     system allows, stay in pinned host memory, from which they are copied without waiting. Others are decoded each time.
-
-    Parameters
-    ----------
-    needs : collection of str
-        "flatness", if it is needed.
-    pin : callable
-        Makes a copy in pinned memory.
+    ``needs``: "flatness", if it is needed. ``pin``: makes a copy in pinned memory.
     """
 
     def __init__(

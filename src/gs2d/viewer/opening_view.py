@@ -33,15 +33,8 @@ class PhotographedArc:
 def guessed_subject(cameras: Sequence[Camera], center: np.ndarray, unit: float, up: np.ndarray) -> Subject:
     """Return a subject for a capture of which only the cameras are known.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-    center : ndarray [3] world units
-        The point that the cameras look at.
-    unit : float, world units
-        Typical distance between the cameras and ``center``.
-    up : ndarray [3]
-        Unit vector.
+    ``center`` [3] world units: the point that the cameras look at. ``unit`` (world units): typical distance between the
+    cameras and ``center``. ``up`` [3]: unit vector.
     """
     size = np.full(3, GUESSED_SIZE * unit)
     aims = [float(camera.rotation[2] @ _unit(center - camera.center)) for camera in cameras]

@@ -70,18 +70,10 @@ def pack_splats(
 ) -> PackedSplats:
     """Pack splats for the page, without invisible ones (not finite, or opacity below ``alpha_min``).
 
-    Raise DataError if more than ``MAX_SPLATS`` are visible.
-
-    Parameters
-    ----------
-    origin : ndarray [3] world units
-        Means are stored relative to it, which preserves their precision in float32.
-    degree : int
-        Highest SH degree to store.
-    alpha_min : float
-    eyes : ndarray [V, 3] world units, optional
-        Camera centres. Splats that are wider than the cameras can have seen them, such as needles that point at the
-        cameras, are marked as spikes.
+    Raise DataError if more than ``MAX_SPLATS`` are visible. ``origin`` [3] world units: means are stored relative to
+    it, which preserves their precision in float32. ``degree``: highest SH degree to store. ``eyes`` [V, 3] world units:
+    camera centres. Splats that are wider than the cameras can have seen them, such as needles that point at the
+    cameras, are marked as spikes.
     """
     splats = splats.to("cpu")
     rows = _visible_rows(splats, alpha_min)

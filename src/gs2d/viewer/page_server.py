@@ -85,12 +85,7 @@ def number_in(arguments: Mapping[str, str], name: str, count: int) -> int:
 class PageServer:
     """Serves routes from its own threads until it is closed.
 
-    Parameters
-    ----------
-    port : int or None
-        None: the first free port from 8080 on.
-    routes : mapping
-        Routes by path, without the slash; ``""`` is the page.
+    ``port``: None: the first free port from 8080 on. ``routes``: routes by path, without the slash; ``""`` is the page.
 
     Attributes
     ----------

@@ -94,14 +94,8 @@ def write_page(
 ) -> dict[str, Any]:
     """Write the page with its data as one file; return ``splats`` stored, ``sh_degree``, and ``bytes`` of the file.
 
-    Parameters
-    ----------
-    sh_degree : int
-        Highest SH degree to store; degrees 3, 2, 1, 0 take 45, 24, 9 or 0 bytes per splat.
-    meshes : mapping of str to bytes, optional
-        ``meshing.web_mesh`` blocks, by the names of :class:`PageOffer`.
-    photographs : sequence of bytes, optional
-        JPEG files, one per view.
+    ``sh_degree``: highest SH degree to store; degrees 3, 2, 1, 0 take 45, 24, 9 or 0 bytes per splat. ``meshes``:
+    ``meshing.web_mesh`` blocks, by the names of :class:`PageOffer`. ``photographs``: JPEG files, one per view.
     """
     meshes = meshes or {}
     packed = pack_for(scene, splats, sh_degree)

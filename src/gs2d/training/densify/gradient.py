@@ -139,18 +139,9 @@ def densify_and_prune(
 ) -> DensifyCounts:
     """Clone small splats and split large ones where the mean screen gradient is high, then prune; N changes.
 
-    Raise DivergedError if no splat would remain.
-
-    Parameters
-    ----------
-    state : TrainState
-        Its statistics are used and then zeroed.
-    iteration : int
-        1-based, of the stage.
-    extent : float, world units
-        Scale that sizes are compared with.
-    white : bool
-        Whether the background is white, which adds an opacity reset.
+    Raise DivergedError if no splat would remain. ``state``: its statistics are used and then zeroed. ``iteration``:
+    1-based, of the stage. ``extent`` (world units): scale that sizes are compared with. ``white``: whether the
+    background is white, which adds an opacity reset.
     """
     splats, sizes = state.splats, _largest(state.splats.scales)
     prunable = partial(_prunable, densify=densify, iteration=iteration, extent=extent, white=white)

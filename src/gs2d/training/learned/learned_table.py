@@ -29,11 +29,7 @@ class LearnedTable:
     """The learned quantities of a recipe on a scene. Their rows are in the training state.
 
     The constructor raises RecipeError if the package of a quantity cannot be imported, or it does not take its options.
-
-    Parameters
-    ----------
-    scene : Scene
-        Scene with the cameras of the capture, at full size.
+    ``scene``: scene with the cameras of the capture, at full size.
 
     Attributes
     ----------
@@ -185,10 +181,8 @@ def _appearances(name: str, quantity: LearnedQuantity, values: Tensor, scene: Sc
 def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | None = None) -> Tensor:
     """Return colours [H, W, 3] of the scene as an image shows them, differentiable in colours and numbers.
 
-    Parameters
-    ----------
-    clipped : Tensor [H, W, 3] bool, optional
-        Clipped pixels of the image, which may be brighter in the scene: there the result is at most 1.
+    ``clipped`` [H, W, 3] bool: clipped pixels of the image, which may be brighter in the scene: there the result is at
+    most 1.
     """
     quantities = _ordered(numbers)
     for quantity, found in quantities:

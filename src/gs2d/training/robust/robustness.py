@@ -61,16 +61,9 @@ def check_free_space(scene: Scene, recipe: Recipe) -> None:
 class Robustness:
     """Dense start, removal of floaters and opacity decay of a recipe on a scene, as far as the recipe has them.
 
-    Parameters
-    ----------
-    raster : RasterSettings
-        Rasterizer settings of training.
-    backend : Backend
-        Renders the trials.
-    processes : ProcessGroup
-        Processes that train together. Process 0 makes the start and the trials for all.
-    frozen : Splats, optional
-        Further splats of the scene, which are not trained.
+    ``raster``: rasterizer settings of training. ``backend``: renders the trials. ``processes``: processes that train
+    together. Process 0 makes the start and the trials for all. ``frozen``: further splats of the scene, which are not
+    trained.
 
     Attributes
     ----------

@@ -36,14 +36,8 @@ def votes_against_unseen(splats: Splats, cameras: Sequence[Camera], raster: Rast
 
     The result is [N] int32, 0 for all other splats. A large splat has one vote against it. If it is near cameras and
     would cover their images, each of these cameras is a vote: one distant image that shows a corner of the splat does
-    not outweigh them.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Cameras of the training images. Small renderings are enough for fractions.
-    raster : RasterSettings
-        Rasterizer settings of training.
+    not outweigh them. ``cameras``: cameras of the training images. Small renderings are enough for fractions.
+    ``raster``: rasterizer settings of training.
     """
     most = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
     large = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)

@@ -47,19 +47,9 @@ def missed(
     """Return which of the proposed splats the training images miss, [N] bool.
 
     The number of images that miss a splat is the sum of their losses divided by the largest. Ten equal losses count as
-    ten images; one large loss among small ones counts as little more than one.
-
-    Parameters
-    ----------
-    splats : Splats
-        N splats.
-    against : Tensor [N] int
-        Number of images that speak against each splat, of which ``ENOUGH`` count; 0: it is not proposed.
-    witnesses : iterable of Witness
-    raster : RasterSettings
-        Rasterizer settings of training.
-    stands_for : float
-        Training images for each witness.
+    ten images; one large loss among small ones counts as little more than one. ``splats``: N splats. ``against`` [N]
+    int: number of images that speak against each splat, of which ``ENOUGH`` count; 0: it is not proposed. ``raster``:
+    rasterizer settings of training. ``stands_for``: training images for each witness.
     """
     proposed = against > 0
     parts = {name: tensor.detach() for name, tensor in splats.items()}
