@@ -40,7 +40,7 @@ LIMITS = {
     "options by name": 70,
     "settings by name": 25,
     "recipes": 22,
-    "fields of recipes": 92,
+    "fields of recipes": 93,
 }
 
 

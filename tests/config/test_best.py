@@ -74,7 +74,7 @@ def test_best_recipes_are_written_and_read(name: str) -> None:
 
 def test_robust_training_has_its_own_start_and_no_prune_by_size() -> None:
     robust = with_robustness(get_recipe("best"))
-    assert robust.dense_start == DenseStart(sphere=True)
+    assert robust.dense_start == DenseStart(sphere=True, adjust=True)
     (stage,) = robust.stages
     assert isinstance(stage.densify, GradDensify)
     assert not any(stage.densify.culls_scale(i) for i in range(1, stage.iterations + 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,13 @@ ANGLE = 0.7  # radians, field of view
 RADIUS = 0.8  # ball radius, world units
 
 
-def ball_image(camera: Camera) -> np.ndarray:
-    """Render the ball at the origin as RGBA uint8 [H, W, 4]; red, green and blue follow x, y, z, with mottling."""
+def mottled(points: np.ndarray) -> np.ndarray:
+    """Return colours [..., 3] of points: red, green and blue follow x, y, z, with mottling."""
+    return np.asarray(0.5 + 0.4 * points / RADIUS + 0.1 * np.sin(9 * points))
+
+
+def ball_image(camera: Camera, paint: Callable[[np.ndarray], np.ndarray] = mottled) -> np.ndarray:
+    """Render the ball at the origin as RGBA uint8 [H, W, 4]; ``paint`` returns the colours of its points."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
     rays = rays @ camera.rotation
@@ -24,8 +30,8 @@ def ball_image(camera: Camera) -> np.ndarray:
     b = rays @ camera.center
     inside = b**2 - camera.center @ camera.center + RADIUS**2
     points = camera.center + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
-    color = 0.5 + 0.4 * points / RADIUS + 0.1 * np.sin(9 * points)
-    rgba = np.concatenate([np.clip(color, 0, 1), np.ones_like(inside)[..., None]], axis=-1) * (inside > 0)[..., None]
+    color = np.clip(paint(points), 0, 1)
+    rgba = np.concatenate([color, np.ones_like(inside)[..., None]], axis=-1) * (inside > 0)[..., None]
     return np.rint(255 * rgba).astype(np.uint8)
 
 

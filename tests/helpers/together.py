@@ -108,7 +108,7 @@ def dropping() -> Recipe:
 def robust() -> Recipe:
     """Return 15 iterations on a wall, with a dense start, floater removal and a search for shiny surface."""
     made = scale_schedule(with_robustness(two_dgs()), 0.0005)
-    start = DenseStart(side=48, min_angle=1.0)
+    start = DenseStart(side=48, min_angle=1.0, adjust=True)
     made = replace(made, dense_start=start, removal=Removal(every=5, decay=0.1))
     made = replace(made, stages=(replace(made.stages[0], densify=None),), sh_degree=1)
     return made.with_loss(LossTerm("normal_smoothness", 0.4))

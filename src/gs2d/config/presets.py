@@ -49,7 +49,7 @@ SETTLING, SETTLED = 0.3, 0.1  # last fraction of iterations in which rates fall,
 DENSE_START = DenseStart(side=256, neighbours=3, fit=True)  # docs/notebook/training.md
 # px; standard deviation of a pixel, a square of side 1 (0.29), rounded: docs/notebook/best.md
 MIP_FILTER = 0.3
-STREET_START = DenseStart(sphere=True)  # docs/notebook/floaters.md
+STREET_START = DenseStart(sphere=True, adjust=True)  # docs/notebook/floaters.md
 
 
 def surface(nc: float = 0.05, distortion: float | None = 0.0, iterations: int = 30_000) -> Stage:
@@ -211,7 +211,7 @@ def best(
         ),
         sh_interval=round(1_000 * part),
     )
-    start = replace(DENSE_START, required=False, sphere=True)
+    start = replace(DENSE_START, required=False, sphere=True, adjust=True)
     return Recipe(name, (stage,), dense_start=start, fused_depth="transmittance", mip_px=MIP_FILTER)
 
 

@@ -305,6 +305,11 @@ class Recipe:
         """Whether any of these quantities is learned."""
         return not self.quantities.keys().isdisjoint(names)
 
+    @property
+    def moves_cameras(self) -> bool:
+        """Whether training cameras may end at other poses than the capture has."""
+        return self.learns("poses") or (self.dense_start is not None and self.dense_start.adjust)
+
     def with_learned(self, *quantities: Quantity) -> Recipe:
         """Return a recipe that learns these quantities, in place of those of the same names."""
         named = {quantity.name: quantity for quantity in (*self.learned, *quantities)}

@@ -32,6 +32,9 @@ class DenseStart:
     required: bool = True  # whether training stops if no depths agree. Otherwise it reports that and starts without.
     # Whether splats on a sphere around the scene are added (``training/start/background_sphere.py``).
     sphere: bool = False
+    # Whether the training cameras are adjusted to the photographs first, if those show that the cameras are off
+    # (``training/start/camera_adjustment.py``).
+    adjust: bool = False
 
 
 @dataclass(frozen=True)

@@ -262,11 +262,11 @@ class ProcessGroup:
         """Return where a mask is True in any process."""
         return self.sum(mask.to(torch.int32)) > 0
 
-    def decide(self, judge: Callable[[], Tensor], like: Tensor) -> Tensor:
-        """Return what ``judge`` returns in process 0: uint8 of the shape and on the device of ``like``."""
+    def decide(self, judge: Callable[[], Tensor], like: Tensor, dtype: torch.dtype = torch.uint8) -> Tensor:
+        """Return what ``judge`` returns in process 0, of the shape and on the device of ``like``."""
         if self._alone:
             return judge()
-        found = judge() if self.leads else torch.empty_like(like, dtype=torch.uint8)
+        found = judge() if self.leads else torch.empty_like(like, dtype=dtype)
         with self.contact():
             distributed.broadcast(found, src=0)
         return found

@@ -44,7 +44,7 @@ from gs2d.training.optimizer import adam_step, begin_stage, lr_at
 from gs2d.training.parallel import ONE_PROCESS, ProcessGroup, Turn
 from gs2d.training.resumable import check_resumable
 from gs2d.training.robust.regularise import is_opaque
-from gs2d.training.robust.robustness import Robustness
+from gs2d.training.robust.robustness import Robustness, with_adjusted_cameras
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
@@ -153,8 +153,10 @@ class Trainer:
         if self._frozen is not None and self._frozen.sh_degree != self.recipe.sh_degree:
             degrees = f"{self._frozen.sh_degree}, the recipe trains {self.recipe.sh_degree}"
             raise RecipeError(f"frozen splats must have the recipe's SH degree, got {degrees}; set sh_degree")
+        scene, sweep = with_adjusted_cameras(scene, self.recipe.dense_start, processes)
+        self.scene = scene
         self.learned = LearnedTable(self.recipe, scene)
-        self._robust = Robustness(scene, begins, self.settings, self.backend, processes, self._frozen)
+        self._robust = Robustness(scene, begins, self.settings, self.backend, processes, self._frozen, sweep)
         if state is not None:
             check_resumable(state, self.recipe, scene)
         self.state = processes.share(lambda: self._first_state(init) if state is None else state)

@@ -64,6 +64,8 @@ def settle(options: TrainOptions, on_event: OnEvent, recipe: Recipe | None = Non
                 "blocks need fixed cameras, got a recipe that learns poses; learn them in a run of its own, or leave "
                 "poses out of --learn"
             )
+        if recipe.dense_start is not None:  # each block would adjust cameras differently
+            recipe = replace(recipe, dense_start=replace(recipe.dense_start, adjust=False))
         protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
         opened = replace(opened, protocol=protocol)
     digest, title = capture_digest(opened.scene), opened.scene.name

@@ -109,9 +109,9 @@ def over(view: View, color: Tensor, background: tuple[float, float, float]) -> t
 
 
 # -- cameras -----------------------------------------------------------------------------------------------------------
-def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent) -> None:
-    """Write ``poses.json`` if the cameras of a scene were refined, and report how far they moved."""
-    if all(now.camera is original.camera for now, original in zip(refined.train, scene.train, strict=True)):
+def write_poses(run: RunFolder, recipe: Recipe, scene: Scene, refined: Scene, on_event: OnEvent) -> None:
+    """Write ``poses.json`` if the recipe moves training cameras, and report how far from those of the capture."""
+    if not recipe.moves_cameras:
         return
     focus = focus_point([view.camera for view in scene.train])
     frames, far = [], []
@@ -121,6 +121,8 @@ def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent)
     frames += [{**_frame(view, scene.root), "split": "test"} for view in refined.test]
     write_json(run.file(POSES), {"format": 1, "about": CAMERAS, "frames": frames})
     mean = {name: float(np.mean([entry[name] for entry in far])) for name in far[0]}
+    if not any(mean.values()):
+        return
     on_event(
         Notice(
             f"cameras moved by {mean['pixels']:.2f} px on average ({mean['degrees']:.3f} degrees, "
@@ -173,11 +175,11 @@ def camera_motion(original: Camera, now: Camera, focus: np.ndarray, extent: floa
 
 
 def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
-    """Return a scene with the cameras of ``poses.json``; unchanged if the run refines none, or is unfinished.
+    """Return a scene with the cameras of ``poses.json``; unchanged if the run moves none, or is unfinished.
 
     Raises RunError if the file is missing, damaged or of other photographs.
     """
-    if not recipe.learns("poses") or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
+    if not recipe.moves_cameras or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
         return scene
     remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
     try:

@@ -291,7 +291,7 @@ class RunLogger:
         """Write the splats, refined cameras and learned appearance, before anything that could fail uses them."""
         with attempted("refined cameras and exposures", None, self._on_event):
             now = self._trainer.scene_now()
-            write_poses(self._run, self._loaded.scene, now, self._on_event)
+            write_poses(self._run, self._loaded.recipe, self._loaded.scene, now, self._on_event)
             write_appearance(self._run, now, self._on_event)
         write_splats(self._run.file(SPLATS), self._trainer.splats)
 

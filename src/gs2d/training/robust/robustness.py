@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,6 +34,7 @@ from gs2d.training.robust.seen_area import LARGEST, LARGEST_ANYWHERE, largest_lo
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.rows import keep_rows
 from gs2d.training.start.background_sphere import sphere_points
+from gs2d.training.start.camera_adjustment import adjust_cameras
 from gs2d.training.start.initialize import Initial
 from gs2d.training.start.plane_sweep import SmallView, Sweep, sweep_views
 from gs2d.training.start.start_fit import fit_start
@@ -58,12 +60,26 @@ def check_free_space(scene: Scene, recipe: Recipe) -> None:
         )
 
 
+def with_adjusted_cameras(
+    scene: Scene, start: DenseStart | None, processes: ProcessGroup
+) -> tuple[Scene, Sweep | None]:
+    """Return the scene with the cameras that process 0 adjusts, if the start does that, and its sweep in process 0."""
+    if start is None or not start.adjust:
+        return scene, None
+    adjusted, sweep = adjust_cameras(scene, start) if processes.leads else (scene, None)
+    poses = torch.from_numpy(np.stack([view.camera.T_cam_world for view in adjusted.train]).astype(np.float64))
+    decided = processes.decide(lambda: poses, poses, torch.float64).numpy()
+    if processes.leads:
+        return adjusted, sweep
+    return scene.with_poses({view.name: pose for view, pose in zip(scene.train, decided, strict=True)}), None
+
+
 class Robustness:
     """Dense start, removal of floaters and opacity decay of a recipe on a scene, as far as the recipe has them.
 
     ``raster``: rasterizer settings of training. ``backend``: renders the trials. ``processes``: processes that train
     together. Process 0 makes the start and the trials for all. ``frozen``: further splats of the scene, which are not
-    trained.
+    trained. ``sweep``: plane sweep of the scene with the settings of the recipe, if it is there already.
 
     Attributes
     ----------
@@ -87,6 +103,7 @@ class Robustness:
         backend: Backend,
         processes: ProcessGroup = ONE_PROCESS,
         frozen: Splats | None = None,
+        sweep: Sweep | None = None,
     ) -> None:
         self._processes, self._frozen = processes, frozen
         self.scene, self._learned, self._recipe = scene, LearnedTable(recipe, scene), recipe
@@ -101,7 +118,7 @@ class Robustness:
         check_free_space(scene, recipe)
         start = recipe.dense_start
         try:
-            sweep = sweep_views(scene, start or DenseStart())
+            sweep = sweep or sweep_views(scene, start or DenseStart())
             if start is not None:
                 # The large splats of a sphere need the removal of those that hide something.
                 around = sphere_points(scene, sweep) if start.sphere and is_opaque(recipe) else None
