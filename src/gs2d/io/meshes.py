@@ -305,14 +305,12 @@ def _glb_attributes(mesh: Mesh | TexturedMesh) -> list[tuple[str, bytes, dict[st
 
 def write_pieces(path: Path, pieces: Sequence[Mesh]) -> None:
     """Write meshes as the objects of one OBJ file, atomically."""
-    lines, first = [], 1
-    for number, piece in enumerate(pieces):
-        lines.append(f"o piece_{number:03d}")
-        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in piece.vertices.tolist()]
-        lines += [f"f {a} {b} {c}" for a, b, c in (piece.faces + first).tolist()]
-        first += len(piece.vertices)
-    with atomic_write(path) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+    first = 1
+    with atomic_write(path, "w") as file:
+        for number, piece in enumerate(pieces):
+            np.savetxt(file, piece.vertices, "v %.9g %.9g %.9g", header=f"o piece_{number:03d}", comments="")
+            np.savetxt(file, piece.faces + first, "f %d %d %d")
+            first += len(piece.vertices)
 
 
 def read_textured(path: str | Path) -> TexturedMesh:
