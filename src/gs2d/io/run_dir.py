@@ -49,6 +49,19 @@ from gs2d.core.text import first_line
 from gs2d.errors import DataError, DiskError, RunError
 from gs2d.io.run_schema import DEFINITION_SHAPE, METRICS_SHAPE, check_shape
 
+RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
+CHECKPOINTS, RENDERS, SURFACE, EDITS = "checkpoints", "renders", "surface", "edits"
+SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
+POSES, LEARNED, SUBJECT, VERDICT = "poses.json", "learned.json", "subject.json", "verdict.json"
+GEOREFERENCE = "georeference.json"
+FORMAT = 2
+KEPT_CHECKPOINTS = 2
+_UNREADABLE = (
+    *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
+_CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
+
 
 class EventLog:
     """Append-only file with one JSON object per line, flushed after each line."""
@@ -126,20 +139,6 @@ class EventLog:
                     "the log was damaged: remove that line"
                 ) from error
         return events
-
-
-RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
-CHECKPOINTS, RENDERS, SURFACE, EDITS = "checkpoints", "renders", "surface", "edits"
-SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
-POSES, LEARNED, SUBJECT, VERDICT = "poses.json", "learned.json", "subject.json", "verdict.json"
-GEOREFERENCE = "georeference.json"
-FORMAT = 2
-KEPT_CHECKPOINTS = 2
-_UNREADABLE = (
-    *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
-_CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
 
 
 @dataclass(frozen=True)

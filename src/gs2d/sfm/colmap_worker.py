@@ -27,6 +27,18 @@ from gs2d.sfm.search import FISHEYES, MAPPING
 
 MIN_AGREEMENT = 0.3  # smallest length of the mean of the cameras' up vectors
 _TOWARDS_MEAN = 0.01  # decides if all right vectors are parallel, negligible otherwise
+Say = Callable[..., None]
+REPEATABLE = 50  # images: up to this many, one thread places them and the same seed gives the same bytes
+SMALLEST_MODEL = 3  # images: smaller models cannot be trained
+# Thresholds for the first image pair, tried in this order until enough images are placed. COLMAP asks for 16 degrees
+# between the two views and no motion along the viewing direction, which a walk straight ahead never fulfils.
+ATTEMPTS: dict[str, dict[str, float]] = {
+    "strictly": {},
+    "as on a walk": {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0},
+}
+AT_ONCE = "all at once"  # the global mapper
+ENOUGH = 0.5  # of the images in one model: no further attempt
+CLEARLY = 1.5  # factor by which a looser attempt must place more images to replace a stricter one
 
 
 def up_direction(rotations: np.ndarray) -> np.ndarray | None:
@@ -42,20 +54,6 @@ def up_direction(rotations: np.ndarray) -> np.ndarray | None:
     spread = right.T @ right / len(right) - _TOWARDS_MEAN * np.outer(mean_up, mean_up)
     up = np.linalg.eigh(spread)[1][:, 0]
     return np.asarray(up if up @ mean_up > 0 else -up)
-
-
-Say = Callable[..., None]
-REPEATABLE = 50  # images: up to this many, one thread places them and the same seed gives the same bytes
-SMALLEST_MODEL = 3  # images: smaller models cannot be trained
-# Thresholds for the first image pair, tried in this order until enough images are placed. COLMAP asks for 16 degrees
-# between the two views and no motion along the viewing direction, which a walk straight ahead never fulfils.
-ATTEMPTS: dict[str, dict[str, float]] = {
-    "strictly": {},
-    "as on a walk": {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0},
-}
-AT_ONCE = "all at once"  # the global mapper
-ENOUGH = 0.5  # of the images in one model: no further attempt
-CLEARLY = 1.5  # factor by which a looser attempt must place more images to replace a stricter one
 
 
 def main(request_path: str) -> None:

@@ -17,6 +17,8 @@ from typing import Any
 
 from gs2d.core.atomic_files import atomic_write
 
+CALIBRATED = "calibrated"  # step: the database has focal lengths
+
 
 class Steps:
     """A folder with the results of finished steps. Each file and each model is complete or absent."""
@@ -57,9 +59,6 @@ class Steps:
     def read(self, pycolmap: Any, name: str) -> Any:
         """Read a model. Every step reads its input from disk, so an interruption does not change the result."""
         return pycolmap.Reconstruction(str(self.folder / name))
-
-
-CALIBRATED = "calibrated"  # step: the database has focal lengths
 
 
 def map_incrementally(

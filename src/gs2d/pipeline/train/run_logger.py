@@ -33,6 +33,9 @@ from gs2d.training.trainer import Trainer
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 SAME = 1.0  # s; a second signal within this time is the first one, sent to the whole process group
+LOG_LINES = 300  # progress lines per stage
+PROBES, PROBE_VIEWS = 30, 4  # times per stage at which views are scored for the PSNR curve, and how many
+REPORT_EVERY, REPORT_EVERY_ON_GPU = 10, 50  # iterations between progress events, for which the host waits for a GPU
 
 
 class HeldSignals:
@@ -80,11 +83,6 @@ class HeldSignals:
             self._heard = (number, time.monotonic())
         elif time.monotonic() - self._heard[1] > SAME:
             self._previous[number](number, frame)
-
-
-LOG_LINES = 300  # progress lines per stage
-PROBES, PROBE_VIEWS = 30, 4  # times per stage at which views are scored for the PSNR curve, and how many
-REPORT_EVERY, REPORT_EVERY_ON_GPU = 10, 50  # iterations between progress events, for which the host waits for a GPU
 
 
 class StageClock:
