@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gs2d.config.densify import Densify
 from gs2d.config.recipe import GradDensify, Recipe, validate
-from gs2d.config.registry import absent_guests, did_you_mean
+from gs2d.config.registry import did_you_mean
 from gs2d.errors import RecipeError
 
 
@@ -28,14 +28,12 @@ def to_json(recipe: Recipe) -> dict[str, Any]:
     return encoded
 
 
-def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
+def from_json(data: Mapping[str, Any]) -> Recipe:
     """Return the recipe of a result of :func:`to_json`, validated.
 
-    For a finished run (``to_train`` False), losses and densifiers of plug-ins may be missing. Raises RecipeError if a
-    key is unknown or missing, or a value has another type.
+    Raises RecipeError if a key is unknown or missing, or a value has another type.
     """
-    with nullcontext() if to_train else absent_guests():
-        recipe = decode(data, Recipe, "recipe")
+    recipe = decode(data, Recipe, "recipe")
     assert isinstance(recipe, Recipe)
     return validate(recipe)
 

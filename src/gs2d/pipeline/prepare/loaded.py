@@ -294,7 +294,7 @@ def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
 
 
 # -- a run on disk -----------------------------------------------------------------------------------------------------
-def reload_run(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> LoadedRun:
+def reload_run(run: RunFolder, on_event: OnEvent) -> LoadedRun:
     """Load a run from its folder, with its refined cameras, to mesh, render or score it again.
 
     Raises RunError or DataError if the capture has moved or changed.
@@ -311,8 +311,7 @@ def reload_run(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> L
         )
     scene = with_refined_poses(run, resolved.recipe, scene)
     scene = with_learned_appearance(run, resolved.recipe, scene)
-    chosen = get_backend(resolved.backend["name"] if backend == "auto" else backend)
-    return LoadedRun(resolved, scene, chosen)
+    return LoadedRun(resolved, scene, get_backend(resolved.backend["name"]))
 
 
 def finished_splats(run: RunFolder) -> Splats:
