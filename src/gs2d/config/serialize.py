@@ -39,7 +39,7 @@ def from_json(data: Mapping[str, Any]) -> Recipe:
 
 
 def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Change fields of a recipe.
+    """Return a recipe with changed fields, validated.
 
     ``overrides``: ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Dots reach deeper
     fields: ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
@@ -47,11 +47,6 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     ``surface.losses.normal_consistency.options.where=object``; entry actions by their name,
     ``refine.on_enter.clone_in_place.options.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
     Values are JSON; other text is a string. Raises RecipeError if a field is unknown, or a value has another type.
-
-    Returns
-    -------
-    Recipe
-        Validated.
     """
     data = to_json(recipe)
     for override in overrides:

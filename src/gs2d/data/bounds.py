@@ -19,17 +19,11 @@ _BLENDER_HALF = 1.3  # half side of the initial box of NeRF-Synthetic in 3DGS an
 def scene_bounds(
     cameras: Sequence[Camera], points: PointCloud | None, *, is_synthetic: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the box that the cameras look at.
+    """Return the box that the cameras look at, [2, 3] float64 in world units, and warnings if it is guessed.
 
     With sparse points: their 1st to 99th percentile on each axis, enlarged by a tenth. Without: the region that most
     cameras see. For synthetic captures: [-1.3, 1.3]^3 if the cameras agree with it. ``is_synthetic``: whether to
     try the box of NeRF-Synthetic first.
-
-    Returns
-    -------
-    bounds : ndarray [2, 3] float64, world units
-    notes : tuple of str
-        Warning about a guessed box.
     """
     if points is not None and len(points) >= 10:
         low, high = np.percentile(points.points, (1, 99), axis=0)

@@ -108,16 +108,11 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
 
 @lru_cache(maxsize=4)  # 12 bytes per pixel; cameras are mostly shared
 def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Return the source position of each pixel of the undistorted image.
+    """Return the source position of each pixel of the undistorted image, and which are valid.
 
-    The undistorted camera keeps size, focal lengths and principal point, so that the forward distortion of its pixel
-    centres is the exact inverse map.
-
-    Returns
-    -------
-    positions : ndarray float32 [H, W, 2] px, corner origin
-    valid : ndarray bool [H, W]
-        True if the position is between pixel centres of the distorted image and the lens is one to one.
+    Positions are float32 [H, W, 2] px, corner origin. They are valid, bool [H, W], between the pixel centres of the
+    distorted image and where the lens is one to one. The undistorted camera keeps size, focal lengths and principal
+    point, so that the forward distortion of its pixel centres is the exact inverse map.
     """
     k = intrinsics
     x = (np.arange(k.width) + 0.5 - k.cx) / k.fx

@@ -107,12 +107,8 @@ def _write_ply(path: Path, mesh: Mesh) -> None:
 def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     """Read a mesh from PLY, OBJ, STL or OFF. Polygons become triangles; other properties are ignored.
 
-    Raises DataError if the file is broken, has vertices but no faces, or a face refers to a missing vertex.
-
-    Returns
-    -------
-    Mesh
-        Vertices are float32, or float64 if the file has doubles or is no PLY.
+    Vertices are float32, or float64 if the file has doubles or is no PLY. Raises DataError if the file is broken, has
+    vertices but no faces, or a face refers to a missing vertex.
     """
     if Path(path).suffix.lower() in FOREIGN:
         return _read_foreign(Path(path))

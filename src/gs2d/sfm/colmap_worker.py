@@ -77,12 +77,8 @@ def main(request_path: str) -> None:
 def map_(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> dict[str, Any]:
     """Estimate cameras and points from the matches; each connected set of images becomes a model.
 
-    Each step reads the result of the step before it and is skipped if it is already finished.
-
-    Returns
-    -------
-    dict
-        ``models``: facts of each model, largest first; ``lens``: the lens that was chosen.
+    Each step reads the result of the step before it and is skipped if it is already finished. The result has
+    ``models``, the facts of each model, largest first, and ``lens``, the lens that was chosen.
     """
     if steps.facts(FISHEYES) is None:
         settle_fisheyes(pycolmap, request, steps, say)

@@ -72,18 +72,10 @@ class Photo:
 
 
 def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
-    """Find the photographs in a folder and its sub-folders.
+    """Return the photographs in a folder and its sub-folders, in natural order, and messages about other files.
 
-    Raises DataError if ``root`` is no folder, or holds too few photographs.
-
-    Returns
-    -------
-    list of Path
-        The photographs, in natural order.
-    tuple of str
-        A message about each kind of other files.
-    str
-        A message about the photographs that cannot be read: how many, why, and the remedy; "" if there are none.
+    There is one message for each kind of other files, and one about the photographs that cannot be read: how many, why,
+    and the remedy; "" if there are none. Raises DataError if ``root`` is no folder, or holds too few photographs.
     """
     if root.is_file():
         other = suggestion(root, "photographs")

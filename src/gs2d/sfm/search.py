@@ -34,12 +34,8 @@ def is_of(work: Path, layer: str, wanted: Any) -> bool:
 def go_on(work: Path, wanted: Mapping[str, Any], *, ours: Sequence[str]) -> str:
     """Keep the layers of an earlier search whose inputs are equal, remove the others, and store the new inputs.
 
-    ``wanted``: inputs of each of ``LAYERS``. ``ours``: folders of the caller that belong to the layer "photographs".
-
-    Returns
-    -------
-    str
-        One line about what is kept; empty without an earlier search.
+    Returns one line about what is kept; empty without an earlier search. ``wanted``: inputs of each of ``LAYERS``.
+    ``ours``: folders of the caller that belong to the layer "photographs".
     """
     before, wanted = _read(work), _plain(wanted)
     first = next((i for i, layer in enumerate(LAYERS) if before.get(layer) != wanted[layer]), len(LAYERS))
