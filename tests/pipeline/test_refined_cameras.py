@@ -14,7 +14,7 @@ from gs2d.data import load_scene
 from gs2d.errors import RunError
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.finish.run_texture import _views
-from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.pipeline.prepare.loaded import open_finished, reload_run
 from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, ignore
@@ -60,8 +60,8 @@ def test_views_have_the_refined_focal_length_and_the_file_can_be_loaded(
 
 
 def test_resized_photographs_have_the_refined_focal_length(run: RunFolder) -> None:
-    job = reload_run(run, ignore)
-    larger = _views(job, TextureOptions(texture_downscale=2), ignore)
+    _, job = open_finished(run.path, 1, ignore)
+    larger = _views(job, TextureOptions(texture_downscale=2), ignore, 1)
     for view, here in zip(larger, job.scene.train, strict=True):
         assert view.camera.width == here.camera.width // 2
         assert view.camera.fx == pytest.approx(here.camera.fx / 2)
