@@ -42,7 +42,7 @@ PHASES = (
     Rule("evaluate", (("pipeline/finish/evaluate.py", "evaluate_run"),)),
 )
 PARTS = (
-    Rule("rasterizer", (("render/native_rasterizer.py", ""), ("render/cpu_cached.py", ""))),
+    Rule("rasterizer", (("render/kernel_backend.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
         "losses and metrics",
         (("gs2d/losses/base.py", ""), ("kernels/native_losses.py", ""), ("evaluation/image_metrics.py", "")),

@@ -44,7 +44,7 @@ _ADDING = (
     "_volume_arrays",
 )  # fuse a view
 PARTS = (
-    Rule("render", (("render/native_rasterizer.py", ""), ("render/cpu_cached.py", ""))),
+    Rule("render", (("render/kernel_backend.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
         "photographs",
         (

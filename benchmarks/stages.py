@@ -17,12 +17,12 @@ from benchmarks.timing import Probe, Timing, probe, summary
 from benchmarks.workload import Workload
 from gs2d.config.presets import two_dgs_r
 from gs2d.config.recipe import GradDensify
-from gs2d.core.splats import Splats
+from gs2d.core.splats import IMAGES, Splats
 from gs2d.kernels.library import Library
 from gs2d.kernels.loss_operations import NormalOptions
 from gs2d.kernels.native_losses import NativeLosses
 from gs2d.render.backends import get_backend
-from gs2d.render.native_rasterizer import IMAGES, rasterize_with
+from gs2d.render.cpu_backend import CpuBackend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.densify.gradient import densify_and_prune
 from gs2d.training.optimizer import adam_step, begin_stage
@@ -46,7 +46,7 @@ class Measured:
 def stage_times(library: Library) -> list[float]:
     """Return milliseconds of this thread's last forward and backward pass, in the order of NATIVE."""
     buffer = (ctypes.c_int64 * 16)()
-    count = library.function("gs2d_stage_times", ctypes.c_int, [ctypes.c_void_p])(buffer)
+    count = library.call("gs2d_stage_times", buffer)
     if count != len(NATIVE):
         raise RuntimeError(f"the native library times {count} stages, expected {len(NATIVE)}; rebuild it")
     return [1e-6 * ns for ns in buffer[:count]]
@@ -54,21 +54,20 @@ def stage_times(library: Library) -> list[float]:
 
 def trim(library: Library) -> None:
     """Free the buffers that the library keeps for the next view."""
-    library.function("gs2d_trim", None, [])()
+    library.call("gs2d_trim")
 
 
 def frame_bytes(library: Library, output: RenderOutput) -> int:
     """Return the bytes that a view currently holds."""
-    frame: Any = output.color.grad_fn
-    return int(library.function("gs2d_frame_bytes", ctypes.c_int64, [ctypes.c_void_p])(frame.frame.pointer))
+    node: Any = output.color.grad_fn
+    return int(library.call("gs2d_frame_bytes", node.state.pointer))
 
 
 def count_work(library: Library, output: RenderOutput, splats: int) -> ViewWork:
     """Count the work of the rendered view; after the backward pass, also of its largest chunk."""
-    frame: Any = output.color.grad_fn
+    node: Any = output.color.grad_fn
     counts = (ctypes.c_int64 * 6)()
-    function = library.function("gs2d_frame_counts", ctypes.c_int, [ctypes.c_void_p] * 2)
-    if function(frame.frame.pointer, counts) != 0:
+    if library.call("gs2d_frame_counts", node.state.pointer, counts) != 0:
         raise MemoryError("no memory to count the pairs of a view")
     pairs, lanes, entries, slots, visible, chunk = counts
     height, width = output.alpha.shape
@@ -87,7 +86,7 @@ class Passes:
 
     def forward(self) -> RenderOutput:
         """Render."""
-        return rasterize_with(self.library, self.leaves, self.camera, self.settings, self.signal)
+        return CpuBackend(self.library).rasterize(self.leaves, self.camera, self.settings, self.signal)
 
     def backward(self, output: RenderOutput) -> None:
         """Compute gradients of every parameter and the densification signal."""

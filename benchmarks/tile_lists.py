@@ -38,7 +38,7 @@ HALVES = np.array([[(w >> 1) * 4 + h * 2 + (w & 1) for h in range(2)] for w in r
 
 def frame_of(launcher: Launcher, splats: Splats, camera: Camera, shortest: int, most: int) -> cuda_passes.ForwardState:
     """Render a view with pieces of at least ``shortest`` entries and at most ``most`` pieces."""
-    parameters = [tensor.detach().contiguous() for _, tensor in splats.items()]
+    parameters = {name: tensor.detach().contiguous() for name, tensor in splats.items()}
     view = cuda_passes.view_of(camera, RasterSettings())
     with patch.multiple(cuda_works, SHORTEST_PIECE=shortest, MOST_PIECES=most):
         return cuda_passes.forward(launcher, view, parameters, distortion=False)

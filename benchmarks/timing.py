@@ -4,7 +4,6 @@ hosts.
 
 from __future__ import annotations
 
-import ctypes
 import platform
 import statistics
 import time
@@ -67,11 +66,11 @@ def _rate(library: Library, name: str, *, scales: bool) -> float:
     Other load on the machine can occupy a core for seconds. A probe on all threads then misses the peak, although a
     short kernel between two interruptions reaches it.
     """
-    function, threads = library.function(name, ctypes.c_double, []), library.threads
-    best = max(function() for _ in range(3))
+    threads = library.threads
+    best = max(library.call(name) for _ in range(3))
     if scales and threads > 1:
         library.use_threads(1)
-        best = max(best, threads * max(function() for _ in range(3)))
+        best = max(best, threads * max(library.call(name) for _ in range(3)))
         library.use_threads(threads)
     return best
 

@@ -76,14 +76,14 @@ INSIDE = {
         "attempts": 1,
     },
     "render": {
-        "tensor_api": 7,
-        "api cpu_backend cuda_backend reference_backend": 6,
+        "tensor_api": 8,
+        "api cpu_backend cuda_backend reference_backend": 7,
+        "kernel_backend": 6,
         "backends": 5,
         "cpu_cached pose_gradient exposure_transform": 4,
-        "native_rasterizer cuda_rasterizer cuda_step reference_contributors reference_errors": 3,
+        "cpu_passes cuda_step reference_contributors reference_errors": 3,
         "cuda_passes reference_rasterizer": 2,
         "pair_budget whole_step cuda_works reference_projection reference_transmittance": 1,
-        "native_image_ops": 1,
         "types": 0,
     },
     "training": {

@@ -19,7 +19,7 @@ from PIL import Image
 from benchmarks.gpu.bench import Bench
 from benchmarks.workload import room
 from gs2d.core.camera import Camera, look_at
-from gs2d.render import cuda_rasterizer as cuda
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import RasterSettings
 
 SYNTHETIC = "synthetic"
@@ -55,7 +55,7 @@ def write_capture(bench: Bench, folder: Path) -> Path:
             frames: list[dict[str, Any]] = []
             for k, camera in enumerate(poses(number, side, phase)):
                 with torch.no_grad():
-                    output = cuda.rasterize_with(bench.launcher, teacher, camera, settings)
+                    output = CudaBackend(launcher=bench.launcher).rasterize(teacher, camera, settings)
                 pixels = (output.color.clamp(0, 1) * 255).round().byte().cpu().numpy()
                 path = folder / split / f"r_{k}.png"
                 pool.submit(Image.fromarray(pixels).save, path, compress_level=1)

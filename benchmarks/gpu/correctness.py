@@ -27,9 +27,9 @@ from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
 from gs2d.kernels.cuda.cuda_losses import CudaLosses
 from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import PLAIN_COLORS, TRANSMITTANCE, Features, RasterSettings
 
 TOOLS = ("memcheck", "racecheck", "synccheck", "initcheck")
@@ -141,7 +141,6 @@ def exercise(bench: Bench) -> list[str]:
 def _render_all_ways(bench: Bench) -> None:
     """Run forward, all backward variants and splat errors; images of more than 32767 tiles only on a GPU."""
     splats, camera = small_scene(bench)
-    launcher = launch.launcher_for(bench.device)
     every = ("color", "normal", "depth_median", "distortion")
     searched = SETTINGS.for_depths(TRANSMITTANCE)
     kinds = [(SETTINGS, names) for names in (every[:1], every[:3], every)]
@@ -149,21 +148,20 @@ def _render_all_ways(bench: Bench) -> None:
     for (settings, names), columns, deterministic in itertools.product(kinds, (2, 4), (False, True)):
         leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
         probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
-        choices = cuda.CudaChoices(deterministic=deterministic)
-        output = cuda.rasterize_with(launcher, leaves, camera, settings, probe, choices=choices)
+        output = CudaBackend(deterministic=deterministic).rasterize(leaves, camera, settings, probe)
         sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
     values = torch.rand(len(splats), 9, device=bench.device, requires_grad=True)
     further, plain = Features(values, values.detach()[0]), replace(SETTINGS, sh_degree=PLAIN_COLORS)
     for names, columns in itertools.product((every[:1], every), (2, 4)):
         probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
-        output = cuda.rasterize_with(launcher, splats, camera, plain, probe, features=further)
+        output = CudaBackend().rasterize_features(splats, camera, plain, further, probe)
         sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
     image = torch.rand(camera.height, camera.width, 3, device=bench.device)
     for occlusion in (False, True):
         splat_errors(splats, camera, image, SETTINGS, backend=bench.backend, occlusion=occlusion)
     if not bench.dry:
         few = splats.rows(torch.arange(20, device=bench.device))
-        cuda.rasterize_with(launcher, few, camera.resized(16, 16 * 32768), SETTINGS)
+        CudaBackend().rasterize(few, camera.resized(16, 16 * 32768), SETTINGS)
 
 
 def _all_losses(bench: Bench) -> None:

@@ -23,7 +23,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.render import cuda_passes
-from gs2d.render import cuda_rasterizer as cuda
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import RasterSettings
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
@@ -117,9 +117,9 @@ def measure_peers(bench: Bench, count: int, width: int, height: int, spread: str
             result[f"times_faster_than_{name}"] = round(theirs / ours, 2)
 
 
-def parameters(scene: GpuScene) -> list[Tensor]:
+def parameters(scene: GpuScene) -> dict[str, Tensor]:
     """Return the parameters in the form that the passes take."""
-    return [tensor.detach().contiguous() for _, tensor in scene.splats.items()]
+    return {name: tensor.detach().contiguous() for name, tensor in scene.splats.items()}
 
 
 def counts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
@@ -148,16 +148,17 @@ def _bits(words: np.ndarray) -> int:
 def kernels(bench: Bench, scene: GpuScene) -> dict[str, float]:
     """Return the median time per kernel over the views, from events; all images except distortion have gradients."""
     timing = TimingLauncher(bench.launcher, bench.dry)
+    backend = CudaBackend(launcher=timing)
     repeats, warmup = (2, 0) if bench.dry else (REPEATS, WARMUP)
     leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in scene.splats.items()})
     for i in range(warmup + repeats):
         camera = scene.cameras[i % len(scene.cameras)]
-        output = cuda.rasterize_with(timing, leaves, camera, SETTINGS)
+        output = backend.rasterize(leaves, camera, SETTINGS)
         (output.color.mean() + output.normal.mean() + output.depth_mean.mean()).backward()
         for _, tensor in leaves.items():
             tensor.grad = None
         with torch.no_grad():
-            cuda.splat_errors_with(timing, scene.splats, camera, output.color.detach(), SETTINGS)
+            backend.splat_errors(scene.splats, camera, output.color.detach(), SETTINGS)
     bench.wait()
     return timing.medians(skip=warmup)
 
@@ -165,13 +166,14 @@ def kernels(bench: Bench, scene: GpuScene) -> dict[str, float]:
 def passes(bench: Bench, scene: GpuScene) -> dict[str, Any]:
     """Time the public function: forward alone, and forward with backward; and its memory."""
     leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in scene.splats.items()})
+    backend = CudaBackend(launcher=bench.launcher)
 
     def forward(i: int) -> None:
         with torch.no_grad():
-            cuda.rasterize_with(bench.launcher, scene.splats, scene.cameras[i % len(scene.cameras)], SETTINGS)
+            backend.rasterize(scene.splats, scene.cameras[i % len(scene.cameras)], SETTINGS)
 
     def both(i: int) -> None:
-        output = cuda.rasterize_with(bench.launcher, leaves, scene.cameras[i % len(scene.cameras)], SETTINGS)
+        output = backend.rasterize(leaves, scene.cameras[i % len(scene.cameras)], SETTINGS)
         (output.color.mean() + output.normal.mean() + output.depth_mean.mean()).backward()
         for _, tensor in leaves.items():
             tensor.grad = None
@@ -200,7 +202,7 @@ def images(bench: Bench, scene: GpuScene) -> list[Tensor]:
     """Return target images [H, W, 3] of the cameras, in [0, 1]."""
     with torch.no_grad():
         return [
-            cuda.rasterize_with(bench.launcher, scene.splats, camera, SETTINGS).color.clamp(0, 1)
+            CudaBackend(launcher=bench.launcher).rasterize(scene.splats, camera, SETTINGS).color.clamp(0, 1)
             for camera in scene.cameras
         ]
 

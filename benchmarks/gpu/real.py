@@ -73,7 +73,7 @@ def lists(bench: Bench, trainer: Trainer) -> dict[str, Any]:
     """Return pair counts and tile list lengths of some views."""
     pairs, longest, spread = [], [], []
     for view in trainer.scene.train[:: max(1, len(trainer.scene.train) // 4)]:
-        parameters = [tensor.detach().contiguous() for _, tensor in trainer.splats.items()]
+        parameters = {name: tensor.detach().contiguous() for name, tensor in trainer.splats.items()}
         given = cuda_passes.view_of(view.camera, trainer.settings)
         ranges = cuda_passes.forward(bench.launcher, given, parameters, distortion=False).ranges.cpu().numpy()
         lengths = (ranges[..., 1] - ranges[..., 0]).ravel()[:-1]

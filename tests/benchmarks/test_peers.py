@@ -12,8 +12,8 @@ from benchmarks import peers
 
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.kernels.library import available_variants, load
-from gs2d.render.native_rasterizer import rasterize_with
+from gs2d.kernels.library import available_variants
+from gs2d.render.cpu_backend import CpuBackend
 from gs2d.render.types import RasterSettings
 
 
@@ -27,7 +27,7 @@ class Twin:
         self.camera = camera
 
     def forward(self) -> Any:
-        return rasterize_with(load(), self.leaves, self.camera, RasterSettings(sh_degree=3))
+        return CpuBackend().rasterize(self.leaves, self.camera, RasterSettings(sh_degree=3))
 
     def backward(self, rendered: Any) -> None:
         rendered.color.sum().backward()

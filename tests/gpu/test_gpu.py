@@ -18,9 +18,9 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source, cubin, source_names
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend, backend_report, get_backend
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training import events
 from gs2d.training.targets import DeviceTargets
@@ -70,7 +70,7 @@ def test_every_kernel_loads(gpu: Backend) -> None:
 def test_the_gpu_gives_what_the_emulator_gives(gpu: Backend) -> None:
     """Images differ only by approximate instructions and flipped decisions."""
     splats, camera = scene(300, (70, 45))
-    low = cuda.rasterize_with(Emulator(), splats, camera, SETTINGS)
+    low = CudaBackend(launcher=Emulator()).rasterize(splats, camera, SETTINGS)
     high = rasterize(splats.to("cuda"), camera, SETTINGS, backend="cuda")
     for name in ("color", "alpha", "normal"):
         difference = (getattr(low, name) - getattr(high, name).cpu()).abs()
@@ -118,12 +118,12 @@ def test_ptx_for_devices_to_come_is_translated_by_the_driver(gpu: Backend) -> No
         code_of=lambda name, arch: compile_source(name, arch).code,
     )
     try:
-        found = cuda.rasterize_with(later, splats.to(device), camera, SETTINGS)
+        found = CudaBackend(launcher=later).rasterize(splats.to(device), camera, SETTINGS)
     except BackendError as error:
         if "UNSUPPORTED_PTX" in str(error):
             pytest.skip("the driver is older than NVRTC")
         raise
-    expected = cuda.rasterize_with(valid, splats.to(device), camera, SETTINGS)
+    expected = CudaBackend(launcher=valid).rasterize(splats.to(device), camera, SETTINGS)
     assert float((found.color - expected.color).abs().median()) < 1e-6
 
 

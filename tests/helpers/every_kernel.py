@@ -13,7 +13,7 @@ from gs2d.core.splats import Splats
 from gs2d.kernels.cuda.cuda_adam import AdamUpdate, adam_step
 from gs2d.kernels.cuda.cuda_losses import CudaLosses
 from gs2d.kernels.loss_operations import NormalOptions
-from gs2d.render import cuda_rasterizer as cuda
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings
@@ -28,10 +28,17 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
     """Return images, splat errors, and all gradients from both accumulation methods."""
     cotangents, found = random_cotangents(np.random.default_rng(1), case.camera), {}
 
-    def render(name: str, trained: tuple[str, ...], settings: RasterSettings = SETTINGS, **options: object) -> None:
+    def render(
+        name: str,
+        trained: tuple[str, ...],
+        settings: RasterSettings = SETTINGS,
+        rows: Tensor | None = None,
+        sure: bool | None = None,
+    ) -> None:
+        backend = CudaBackend(launcher=emulator, deterministic=sure)
         leaves = Splats(**{k: t.clone().requires_grad_(k in trained) for k, t in case.splats.items()})
         probe = torch.zeros(len(leaves), 4, requires_grad=True) if "means" in trained else None
-        output = cuda.rasterize_with(emulator, leaves, case.camera, settings, probe, **options)  # type: ignore[arg-type]
+        output = backend.rasterize(leaves, case.camera, settings, probe, rows)
         there = {k: c for k, c in cotangents.items() if k != "distortion" or settings.with_distortion}
         total = contraction(output, there)
         if settings.with_transmittance_depth:
@@ -45,19 +52,16 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
     every = tuple(name for name, _ in case.splats.items())
     rows = torch.arange(len(case.splats)) % 3 == 0
     for sure in (False, True):
-        choices = cuda.CudaChoices(deterministic=sure)
-        render(f"all {sure}", every, choices=choices)
-        render(f"colours {sure}", ("sh0", "shN"), choices=choices, gradient_rows=rows)
+        render(f"all {sure}", every, sure=sure)
+        render(f"colours {sure}", ("sh0", "shN"), rows=rows, sure=sure)
     numbers = torch.randn(len(case.splats), 9, generator=_numbers())
     for columns in (2, 4):
         for distortion, sure in ((False, False), (True, False), (True, True)):
             values, probe = numbers.clone().requires_grad_(), torch.zeros(len(numbers), columns, requires_grad=True)
             settings = replace(SETTINGS, sh_degree=PLAIN_COLORS)
             further = Features(values, numbers[0])
-            choices = cuda.CudaChoices(deterministic=sure)
-            output = cuda.rasterize_with(
-                emulator, case.splats, case.camera, settings, probe, features=further, choices=choices
-            )
+            backend = CudaBackend(launcher=emulator, deterministic=sure)
+            output = backend.rasterize_features(case.splats, case.camera, settings, further, probe)
             (output.color.square().sum() + (output.distortion.sum() if distortion else 0.0)).backward()
             assert values.grad is not None
             assert probe.grad is not None
@@ -67,7 +71,7 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
     image, mask = torch.rand(45, 70, 3, generator=_numbers()), torch.rand(45, 70, generator=_numbers()) > 0.3
     for occlusion in (False, True):
         inputs = (case.splats, case.camera, image, SETTINGS, mask, occlusion)
-        found[f"errors {occlusion}"] = cuda.splat_errors_with(emulator, *inputs)
+        found[f"errors {occlusion}"] = CudaBackend(launcher=emulator).splat_errors(*inputs)
     return found
 
 

@@ -11,10 +11,8 @@ from torch import Tensor
 
 import render_oracle
 from emulate import Emulator
-from fake_backends import altered
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.api import rasterize
 from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -30,13 +28,8 @@ def render(
     settings: RasterSettings,
     probe: Tensor | None = None,
 ) -> RenderOutput:
-    """Render through the public function, as a backend does."""
-
-    def run(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
-        return cuda.rasterize_with(launcher, s, c, r, p)
-
-    backend = altered(CudaBackend(), rasterize=run)  # splat errors are not requested here
-    return rasterize(splats, camera, settings, backend=backend, screen_probe=probe)
+    """Render through the public function."""
+    return rasterize(splats, camera, settings, backend=CudaBackend(launcher=launcher), screen_probe=probe)
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ import copy
 import torch
 from benchmarks.workload import room_workload
 
-from gs2d.core.splats import Splats
+from gs2d.core.splats import IMAGES, Splats
 from gs2d.kernels.buffer_pool import LINE, BufferPool
 from gs2d.kernels.library import Library
-from gs2d.render.native_rasterizer import IMAGES, rasterize_with
+from gs2d.render.cpu_backend import CpuBackend
 from gs2d.render.types import RasterSettings
 
 FLOAT = torch.float32
@@ -50,7 +50,7 @@ def test_images_and_gradients_in_used_memory_have_the_same_bits(native: Library)
 
     def differentiated(library: Library) -> list[torch.Tensor]:
         leaves = Splats(**{name: t.clone().requires_grad_() for name, t in room.splats.items()})
-        output = rasterize_with(library, leaves, room.cameras[0], RasterSettings())
+        output = CpuBackend(library).rasterize(leaves, room.cameras[0], RasterSettings())
         images = [getattr(output, name) for name in IMAGES]
         total = torch.stack([(image * image).sum() for image in images]).sum()
         found = torch.autograd.grad(total, [t for _, t in leaves.items()])

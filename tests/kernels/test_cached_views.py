@@ -10,8 +10,8 @@ from torch import Tensor
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
-from gs2d.render.cpu_cached import CachedView, cache_view
-from gs2d.render.native_rasterizer import rasterize_with
+from gs2d.render.cpu_backend import CpuBackend
+from gs2d.render.cpu_cached import CachedView
 from gs2d.render.types import RasterSettings
 
 COUNT, ROOM = 300, 1 << 30
@@ -50,7 +50,7 @@ ROWS = torch.arange(0, COUNT, 5)
 
 
 def cached_view(library: Library, splats: Splats, degree: int = 3, rows: Tensor = ROWS) -> CachedView:
-    view = cache_view(splats, camera(), settings(degree), rows, limit_bytes=ROOM, library=library)
+    view = CpuBackend(library).cache_view(splats, camera(), settings(degree), rows, limit_bytes=ROOM)
     assert view is not None
     return view
 
@@ -75,7 +75,7 @@ def test_a_cached_view_has_the_image_to_rounding_and_the_gradients_to_the_bit(an
     leaves = splats.clone()
     leaves.sh0.requires_grad_()
     leaves.shN.requires_grad_()
-    plain = rasterize_with(any_native, leaves, camera(), settings(degree)).color
+    plain = CpuBackend(any_native).rasterize(leaves, camera(), settings(degree)).color
     plain.backward(upstream)
     image, sh0, shN = differentiated(cached_view(any_native, splats, degree), splats, upstream)
     assert (image - plain.detach()).abs().max() <= (1e-14 if any_native.dtype == torch.float64 else 1e-6)
@@ -94,10 +94,10 @@ def test_the_weights_follow_the_colours_that_change_and_not_those_at_the_time_of
     view = cached_view(native64, splats)
     painted = splats.clone()
     painted.sh0[ROWS] += torch.rand(len(ROWS), 1, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    expected = rasterize_with(native64, painted, camera(), settings()).color
+    expected = CpuBackend(native64).rasterize(painted, camera(), settings()).color
     image = view.render(painted.sh0[ROWS], painted.shN[ROWS])
     assert (image - expected).abs().max() < 1e-14
-    assert (image - rasterize_with(native64, splats, camera(), settings()).color).abs().max() > 0.01
+    assert (image - CpuBackend(native64).rasterize(splats, camera(), settings()).color).abs().max() > 0.01
     again = cached_view(native64, painted)
     assert all(torch.equal(view.arrays[name], again.arrays[name]) for name in view.arrays)
 
@@ -116,10 +116,10 @@ def test_cached_views_have_the_same_bits_for_any_number_of_threads(native: Libra
 def test_a_view_is_cached_exactly_where_its_bytes_fit(native: Library) -> None:
     splats = make_splats(native.dtype)
     size = cached_view(native, splats).nbytes
-    exact = cache_view(splats, camera(), settings(), ROWS, limit_bytes=size, library=native)
+    exact = CpuBackend(native).cache_view(splats, camera(), settings(), ROWS, limit_bytes=size)
     assert exact is not None
     assert exact.nbytes == size
-    assert cache_view(splats, camera(), settings(), ROWS, limit_bytes=size - 1, library=native) is None
+    assert CpuBackend(native).cache_view(splats, camera(), settings(), ROWS, limit_bytes=size - 1) is None
 
 
 @pytest.mark.parametrize("rows", [[], [7]])
@@ -128,7 +128,7 @@ def test_without_a_visible_row_the_frozen_image_is_the_plain_one_to_the_bit(nati
     splats.means[7] = torch.tensor([9.0, 0.0, 1.0])  # behind the camera
     view = cached_view(native, splats, rows=learning)
     image, sh0, shN = differentiated(view, splats, upstream_of(native.dtype), learning)
-    assert torch.equal(image, rasterize_with(native, splats, camera(), settings()).color)
+    assert torch.equal(image, CpuBackend(native).rasterize(splats, camera(), settings()).color)
     assert len(view.arrays["entry_row"]) == 0
     assert (sh0 == 0).all()
     assert (shN == 0).all()

@@ -15,7 +15,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
-from gs2d.render import native_rasterizer as cpu
+from gs2d.render.cpu_backend import CpuBackend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 
@@ -42,7 +42,8 @@ def everything(
     """Return images, radii, gradients and splat errors of one view, by name."""
     leaves = requiring_grad(splats.to(dtype=library.dtype))
     probe = torch.zeros(len(splats), 4, dtype=library.dtype, requires_grad=True)
-    output = cpu.rasterize_with(library, leaves, camera, settings, probe, exact_masks=exact)
+    backend = CpuBackend(library, exact_masks=exact)
+    output = backend.rasterize(leaves, camera, settings, probe)
     generator = torch.Generator().manual_seed(1)
     images = [getattr(output, name) for name in IMAGES]
     torch.autograd.backward(images, [torch.randn(i.shape, generator=generator, dtype=i.dtype) for i in images])
@@ -50,9 +51,7 @@ def everything(
     found |= {f"d_{name}": tensor.grad for name, tensor in (*leaves.items(), ("probe", probe))}  # type: ignore[misc]
     photo = torch.rand(camera.height, camera.width, 3, generator=generator, dtype=library.dtype)
     for occlusion in (False, True):
-        found[f"errors_{occlusion}"] = cpu.splat_errors_with(
-            library, leaves.detach(), camera, photo, settings, None, occlusion, exact_masks=exact
-        )
+        found[f"errors_{occlusion}"] = backend.splat_errors(leaves.detach(), camera, photo, settings, None, occlusion)
     return found
 
 

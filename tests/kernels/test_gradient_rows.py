@@ -11,9 +11,9 @@ from benchmarks.workload import Workload, room_workload
 from torch import Tensor
 
 from gs2d.kernels.library import Library
-from gs2d.render import native_rasterizer as cpu
 from gs2d.render.api import rasterize
 from gs2d.render.backends import get_backend
+from gs2d.render.cpu_backend import CpuBackend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, front_camera, requiring_grad, splat
 
@@ -35,7 +35,7 @@ def gradients(
     leaves = requiring_grad(room.splats.to(dtype=library.dtype))
     zeros = torch.zeros(len(leaves), max(probe, 2), dtype=library.dtype, requires_grad=probe > 0)
     settings = RasterSettings(background=(0.2, 0.5, 0.7))
-    output = cpu.rasterize_with(library, leaves, room.cameras[0], settings, zeros if probe else None, rows)
+    output = CpuBackend(library).rasterize(leaves, room.cameras[0], settings, zeros if probe else None, rows)
     chosen = [getattr(output, name) for name in images]
     generator = torch.Generator().manual_seed(7)
     given = [torch.randn(image.shape, generator=generator).to(image) for image in chosen]

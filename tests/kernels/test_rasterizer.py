@@ -14,9 +14,9 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError
 from gs2d.kernels.library import Library, available_variants, load
-from gs2d.render import native_rasterizer as cpu
 from gs2d.render import reference_errors
 from gs2d.render import reference_rasterizer as reference
+from gs2d.render.cpu_backend import CpuBackend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 
@@ -38,7 +38,7 @@ def everything(library: Library, splats: Splats, camera: Camera, *, seed: int = 
     """Return all images, radii, gradients and splat errors of one view, by name."""
     leaves = requiring_grad(splats.to(dtype=library.dtype))
     zeros = torch.zeros(len(splats), probe, dtype=library.dtype, requires_grad=True) if probe else None
-    output = cpu.rasterize_with(library, leaves, camera, SETTINGS, zeros)
+    output = CpuBackend(library).rasterize(leaves, camera, SETTINGS, zeros)
     given = cotangents(camera, library.dtype, seed)
     torch.autograd.backward([getattr(output, name) for name in IMAGES], [given[name] for name in IMAGES])
     image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(9)).to(library.dtype)
@@ -47,9 +47,8 @@ def everything(library: Library, splats: Splats, camera: Camera, *, seed: int = 
     if zeros is not None and zeros.grad is not None:
         found["d_probe"] = zeros.grad
     for occlusion in (False, True):
-        found[f"errors_{occlusion}"] = cpu.splat_errors_with(
-            library, leaves.detach(), camera, image, SETTINGS, None, occlusion
-        )
+        given_errors = (leaves.detach(), camera, image, SETTINGS, None, occlusion)
+        found[f"errors_{occlusion}"] = CpuBackend(library).splat_errors(*given_errors)
     return found
 
 
@@ -108,7 +107,7 @@ def test_gradients_of_every_image_equal_finite_differences(native64: Library, im
     given = cotangents(camera, torch.float64, 3)[image]
 
     def scalar(*tensors: Tensor) -> Tensor:
-        output = cpu.rasterize_with(native64, Splats(*tensors), camera, SETTINGS)
+        output = CpuBackend(native64).rasterize(Splats(*tensors), camera, SETTINGS)
         return (getattr(output, image) * given).sum()
 
     inputs = tuple(tensor.clone().requires_grad_() for _, tensor in splats.items())
@@ -156,7 +155,7 @@ def test_culling_inside_tiles_does_not_change_a_single_bit(any_native: Library, 
     splats, camera = awkward_scene(50 + seed, 150)
     splats = splats.to(dtype=any_native.dtype)
     culled, full = (
-        cpu.rasterize_with(any_native, splats, camera, SETTINGS, exact_masks=exact) for exact in (True, False)
+        CpuBackend(any_native, exact_masks=exact).rasterize(splats, camera, SETTINGS) for exact in (True, False)
     )
     for name in IMAGES:
         assert torch.equal(getattr(culled, name), getattr(full, name)), name
@@ -172,7 +171,7 @@ def test_images_of_any_size_are_filled_to_the_last_pixel(any_native: Library, si
     splats = Splats(
         0 * one, quat, 5 * one[:, :2], 20 * one[:, 0], one[None], torch.zeros(1, 0, 3, dtype=any_native.dtype)
     )
-    output = cpu.rasterize_with(any_native, splats, camera, replace(SETTINGS, sh_degree=0))
+    output = CpuBackend(any_native).rasterize(splats, camera, replace(SETTINGS, sh_degree=0))
     assert torch.allclose(output.alpha, torch.full_like(output.alpha, 0.99))
     assert output.radii.item() == max(width, height) / 2
 
@@ -191,7 +190,7 @@ def test_only_the_wanted_gradients_are_computed_and_they_are_the_same(
     part = splats.to(dtype=any_native.dtype).clone()
     for name in wanted:
         getattr(part, name).requires_grad_()
-    output = cpu.rasterize_with(any_native, part, camera, SETTINGS)
+    output = CpuBackend(any_native).rasterize(part, camera, SETTINGS)
     given = cotangents(camera, any_native.dtype, 0)
     torch.autograd.backward([getattr(output, name) for name in IMAGES], [given[name] for name in IMAGES])
     for name, tensor in part.items():
@@ -213,7 +212,7 @@ def test_memory_of_views_without_a_backward_pass_is_given_back() -> None:
         if i == 5:
             gc.collect()
             before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        cpu.rasterize_with(native, splats, camera, SETTINGS)
+        CpuBackend(native).rasterize(splats, camera, SETTINGS)
     growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before  # KiB on Linux
     assert growth < 150_000
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import numpy as np
 import pytest
 import torch
@@ -18,12 +16,9 @@ def real(library: Library) -> np.dtype:
 
 
 def apply(library: Library, name: str, x: np.ndarray) -> np.ndarray:
-    function = library.function(
-        "gs2d_selftest_unary", ctypes.c_int, [ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
-    )
     padded = np.ascontiguousarray(np.resize(x, -(-len(x) // 64) * 64), dtype=real(library))
     out = np.empty_like(padded)
-    assert function(UNARY[name], padded.ctypes.data, out.ctypes.data, len(padded))
+    assert library.call("gs2d_selftest_unary", UNARY[name], padded, out, len(padded))
     return out[: len(x)].astype(np.float64)
 
 
@@ -67,14 +62,14 @@ def test_transpose_swaps_rows_and_columns(any_native: Library) -> None:
     n = any_native.lanes
     x = np.arange(n * n, dtype=real(any_native)).reshape(n, n)
     out = np.empty_like(x)
-    any_native.function("gs2d_selftest_transpose", None, [ctypes.c_void_p] * 2)(x.ctypes.data, out.ctypes.data)
+    any_native.call("gs2d_selftest_transpose", x, out)
     assert np.array_equal(out, x.T)
 
 
 def test_transposing_reduction_sums_each_vector_into_its_own_lane(any_native: Library) -> None:
     x = np.random.default_rng(0).integers(-99, 99, size=(20, any_native.lanes)).astype(real(any_native))
     out = np.empty(20, dtype=x.dtype)
-    any_native.function("gs2d_selftest_transpose_reduce", None, [ctypes.c_void_p] * 2)(x.ctypes.data, out.ctypes.data)
+    any_native.call("gs2d_selftest_transpose_reduce", x, out)
     assert np.array_equal(out, x.sum(axis=1))
 
 
@@ -82,11 +77,8 @@ def test_transposing_reduction_sums_each_vector_into_its_own_lane(any_native: Li
 def test_lists_of_entries_hold_exactly_those_with_the_bit_in_order(any_native: Library, n: int) -> None:
     masks = np.random.default_rng(n).integers(0, 2**32, size=n + 64, dtype=np.uint32)  # bits beyond n must not count
     out = np.zeros(n + 64, dtype=np.uint32)
-    compress = any_native.function(
-        "gs2d_selftest_indices_with_bit", ctypes.c_int, [ctypes.c_void_p, ctypes.c_int, ctypes.c_int, ctypes.c_void_p]
-    )
     for bit in (0, 5, 31):
-        count = compress(masks.ctypes.data, n, bit, out.ctypes.data)
+        count = any_native.call("gs2d_selftest_indices_with_bit", masks, n, bit, out)
         assert out[:count].tolist() == [i for i in range(n) if masks[i] >> bit & 1]
 
 
@@ -95,8 +87,7 @@ def test_packed_rows_become_vectors_and_rows_again(any_native: Library, k: int) 
     n = any_native.lanes
     rows = np.arange(n * k, dtype=real(any_native)).reshape(n, k)
     vectors, back = np.empty((k, n), rows.dtype), np.empty_like(rows)
-    function = any_native.function("gs2d_selftest_packed", None, [ctypes.c_int] + [ctypes.c_void_p] * 3)
-    function(k, rows.ctypes.data, vectors.ctypes.data, back.ctypes.data)
+    any_native.call("gs2d_selftest_packed", k, rows, vectors, back)
     assert np.array_equal(vectors, rows.T)
     assert np.array_equal(back, rows)
 
@@ -105,36 +96,36 @@ def test_rows_of_eight_become_columns(any_native: Library) -> None:
     n = any_native.lanes
     rows = np.arange(n * 8, dtype=real(any_native)).reshape(n, 8)
     out = np.empty((8, n), rows.dtype)
-    any_native.function("gs2d_selftest_columns", None, [ctypes.c_void_p] * 2)(rows.ctypes.data, out.ctypes.data)
+    any_native.call("gs2d_selftest_columns", rows, out)
     assert np.array_equal(out, rows.T)
 
 
 def test_bits_are_added_in_the_lanes_of_a_mask_and_move_to_the_left(any_native: Library) -> None:
     n = any_native.lanes
-    function = any_native.function("gs2d_selftest_with_bits", None, [ctypes.c_void_p] * 3)
     random = np.random.default_rng(0)
     for masks, bits in zip(random.integers(0, 1 << n, (50, 2)), random.integers(0, 1 << 28, (50, 2)), strict=True):
         in_lane = masks[:, None] >> np.arange(n) & 1
         out = np.empty(n, np.uint32)
         arguments = masks.astype(np.uint32), bits.astype(np.uint32)
-        function(arguments[0].ctypes.data, arguments[1].ctypes.data, out.ctypes.data)
+        any_native.call("gs2d_selftest_with_bits", *arguments, out)
         assert np.array_equal(out, in_lane[0] * bits[0] << 4 | in_lane[1] * bits[1])
 
 
 def test_nonzero_masks_are_set_for_every_block_of_a_tile(any_native: Library) -> None:
     n = any_native.lanes
-    function = any_native.function("gs2d_selftest_nonzero", ctypes.c_uint32, [ctypes.c_void_p])
     random = np.random.default_rng(0)
     for fraction in (0.0, 0.1, 0.9, 1.0):
         numbers = np.where(random.random(256 // n) < fraction, random.integers(1, 1 << n, 256 // n), 0).astype(
             np.uint32
         )
-        assert function(numbers.ctypes.data) == sum(1 << b for b, number in enumerate(numbers) if number)
+        assert any_native.call("gs2d_selftest_nonzero", numbers) == sum(
+            1 << b for b, number in enumerate(numbers) if number
+        )
 
 
 def test_planes_are_unzipped_and_repeated(any_native: Library) -> None:
     n = any_native.lanes
     fields = np.arange(1, 9, dtype=real(any_native))
     out = np.empty((3, n), fields.dtype)
-    any_native.function("gs2d_selftest_unzip", None, [ctypes.c_void_p] * 2)(fields.ctypes.data, out.ctypes.data)
+    any_native.call("gs2d_selftest_unzip", fields, out)
     assert np.array_equal(out, np.tile([[1, 3, 5, 0], [2, 4, 6, 0], [0, 0, 7, 8]], n // 4))

@@ -14,7 +14,6 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import Features, RasterSettings, RenderOutput
@@ -68,28 +67,7 @@ def _available(name: str) -> Backend:
 
 
 def _emulated(launcher: Launcher) -> Backend:
-    def rasterize(
-        s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None, rows: Tensor | None = None
-    ) -> RenderOutput:
-        return cuda.rasterize_with(launcher, s, c, r, p, rows)
-
-    def splat_errors(
-        s: Splats, c: Camera, image: Tensor, r: RasterSettings, mask: Tensor | None = None, occlusion: bool = False
-    ) -> Tensor:
-        return cuda.splat_errors_with(launcher, s, c, image, r, mask, occlusion)
-
-    def rasterize_features(
-        s: Splats, c: Camera, r: RasterSettings, f: Features, p: Tensor | None = None
-    ) -> RenderOutput:
-        return cuda.rasterize_with(launcher, s, c, r, p, features=f)
-
-    return altered(
-        CudaBackend(),
-        device="cpu",
-        rasterize=rasterize,
-        rasterize_features=rasterize_features,
-        splat_errors=splat_errors,
-    )
+    return altered(CudaBackend(launcher=launcher), device="cpu")
 
 
 def _from_host(backend: Backend) -> Backend:

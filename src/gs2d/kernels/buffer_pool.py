@@ -16,8 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["MIN_BYTES", "BufferPool"]
-
 MIN_BYTES = 32 << 20  # glibc returns larger blocks to the system
 LINE = 64  # bytes of a cache line
 PATIENCE = 64  # requests after which a free block is dropped; an iteration makes at most 13

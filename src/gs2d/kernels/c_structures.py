@@ -12,14 +12,19 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-__all__ = ["fill", "filled", "source_of", "structure"]
-
 COMMENT = re.compile(r"//[^\n]*")
 STRUCTURE = re.compile(r"struct (\w+) \{([^{}]*)\};")  # of data only: a method has braces
+EXPORT = re.compile(r"GS2D_EXPORT (\w+) (\w+)\(([^)]*)\)")  # result, name, parameters
 MEMBER = re.compile(r"(?:const )?(\w+)(?:<float>)?([^;]+);")  # type and declarators
 LENGTH = re.compile(r"\[(\w+)\]")
 SCALARS: dict[str, Any] = {"float": ctypes.c_float, "double": ctypes.c_double, "int": ctypes.c_int32}
-SCALARS |= {"int32_t": ctypes.c_int32, "int64": ctypes.c_int64, "int64_t": ctypes.c_int64}
+SCALARS |= {
+    "void": None,
+    "uint32_t": ctypes.c_uint32,
+    "int32_t": ctypes.c_int32,
+    "int64": ctypes.c_int64,
+    "int64_t": ctypes.c_int64,
+}
 SCALARS |= dict.fromkeys(("real", "R", "S"), ctypes.c_float)  # not in float64 libraries; parameters of templates
 
 
@@ -35,6 +40,26 @@ def source_of(where: str) -> str:
 
 
 @cache
+def _exports() -> dict[str, tuple[str, list[str]]]:
+    """Return the type of the result and the parameters of each function that the CPU library exports."""
+    found = EXPORT.findall(source_of("cpu"))
+    return {name: (result, [p for p in parameters.split(",") if p.strip()]) for result, name, parameters in found}
+
+
+def signature_of(function: str, real: Any) -> tuple[Any, list[Any]]:
+    """Return the types of the result and the parameters of an exported function; ``real`` is the library's number."""
+    result, parameters = _exports()[function]
+    scalars = SCALARS | {"real": real}
+    return scalars[result], [ctypes.c_void_p if re.search(r"[*\[]", p) else scalars[p.split()[0]] for p in parameters]
+
+
+def arguments_of(function: str, /, **fields: Any) -> ctypes.Structure:
+    """Return the structure that an exported function takes as its first parameter; other fields are 0 or null."""
+    first = _exports()[function][1][0].removeprefix("const ")
+    return filled(structure(re.findall(r"\w+", first)[0], "cpu"), **fields)
+
+
+@cache
 def structure(name: str, where: str) -> type[ctypes.Structure]:
     """Return a C++ structure by its name; setting a field that it lacks is an error.
 
@@ -42,7 +67,7 @@ def structure(name: str, where: str) -> type[ctypes.Structure]:
     ----------
     name : str
     where : str
-        Source file in ``kernels/``, or the folder "cuda".
+        Folder "cpu" or "cuda", or source file in ``kernels/`` if the name is not unique.
     """
     text = source_of(where)
     (members,) = (members for known, members in STRUCTURE.findall(text) if known == name)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-
 from torch import Tensor
 
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, ready_library
-
-__all__ = ["accumulate"]
 
 
 def accumulate(
@@ -41,8 +37,4 @@ def accumulate(
         if not tensor.is_contiguous():
             raise ShapeError(f"{name} must be contiguous to be changed in place")
     signal, radii, *changed = library.arrays(signal=signal, radii=radii, **sums)
-    pointer = ctypes.c_void_p
-    function = library.function(
-        "gs2d_accumulate_signal", None, (pointer, ctypes.c_int, pointer, ctypes.c_int64, pointer, pointer, pointer)
-    )
-    function(signal.data_ptr(), columns, radii.data_ptr(), len(radii), *(tensor.data_ptr() for tensor in changed))
+    library.call("gs2d_accumulate_signal", signal, columns, radii, len(radii), *changed)

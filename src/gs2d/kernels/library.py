@@ -9,15 +9,16 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.buffer_pool import BufferPool
+from gs2d.kernels.c_structures import arguments_of, signature_of
 
 ABI_VERSION = 10  # version of the function signatures; a library with another version is refused
 RESULTS_VERSION = 9  # version of the computed bits; a run resumes only with the version it started with
@@ -56,22 +57,28 @@ class Library:
         self.path = path
         self.variant = variant
         self.pool = BufferPool()
-        self._functions: dict[tuple[Any, ...], Any] = {}
+        self._functions: dict[str, Any] = {}
         self.lanes = int(self._dll.gs2d_lanes())
         self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32
 
-    def function(self, name: str, restype: Any, argtypes: Sequence[Any]) -> Any:
-        """Return the exported function ``name`` with its C signature. The GIL is released while it runs."""
-        key = (name, restype, *argtypes)  # one object per signature, so that callers do not share argtypes
-        function = self._functions.get(key)
+    def call(self, name: str, /, *arguments: Any, **fields: Any) -> Any:
+        """Call the exported function ``name`` with the signature in its source. The GIL is released while it runs.
+
+        Tensors, arrays and structures are passed by address, None as null. With ``fields`` the argument is the
+        structure of these fields.
+        """
+        function = self._functions.get(name)
         if function is None:
             try:
                 function = self._dll[name]
             except AttributeError as error:
                 raise BackendError(f"the CPU kernels {self.path.name} are older than gs2d; {REMEDY}") from error
-            function.restype, function.argtypes = restype, list(argtypes)
-            self._functions[key] = function
-        return function
+            real = ctypes.c_double if self.dtype == torch.float64 else ctypes.c_float
+            function.restype, function.argtypes = signature_of(name, real)
+            self._functions[name] = function
+        if fields:
+            arguments = (arguments_of(name, **fields),)
+        return function(*map(_passed, arguments))
 
     def arrays(self, **tensors: torch.Tensor | None) -> list[Any]:
         """Return the tensors, detached and contiguous, in the order of the arguments; None stays None.
@@ -102,6 +109,15 @@ class Library:
     def instruction_set(self) -> str:
         """Name of the instruction set, for display."""
         return LANGUAGE[self.variant]
+
+
+def _passed(value: Any) -> Any:
+    """Return an argument in the form that ctypes takes."""
+    if isinstance(value, torch.Tensor):
+        return value.data_ptr()
+    if isinstance(value, np.ndarray):
+        return value.ctypes.data
+    return ctypes.byref(value) if isinstance(value, ctypes.Structure) else value
 
 
 def _path(variant: str) -> Path:

@@ -16,8 +16,6 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 
-__all__ = ["LossOperations", "NormalOptions"]
-
 
 @dataclass(frozen=True, eq=False)
 class NormalOptions:

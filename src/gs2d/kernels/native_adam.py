@@ -14,8 +14,6 @@ from gs2d.errors import ShapeError
 from gs2d.kernels.c_structures import fill, structure
 from gs2d.kernels.library import Library, ready_library
 
-__all__ = ["AdamUpdate", "adam_step", "bias_corrections", "check_update", "first_not_finite"]
-
 
 @dataclass(frozen=True, eq=False)
 class AdamUpdate:
@@ -97,7 +95,7 @@ def adam_step(
         If a tensor has another shape, dtype or device, or a row index is out of range.
     """
     library = library or ready_library()
-    attributes = (structure("AdamAttribute", "cpu/adam.cpp") * len(updates))()
+    attributes = (structure("AdamAttribute", "cpu") * len(updates))()
     alive = []  # tensors behind the pointers
     for slot, update in zip(attributes, updates, strict=True):
         check_update(update)
@@ -115,8 +113,7 @@ def adam_step(
         slot.compact = update.compact
         slot.step_size, slot.root_2 = bias_corrections(update.rate, update.step, beta1, beta2)
         alive += [*tensors, rows]
-    function = library.function("gs2d_adam", ctypes.c_int, (ctypes.c_void_p, ctypes.c_int, *[ctypes.c_double] * 3))
-    if function(attributes, len(updates), beta1, beta2, eps) != 0:
+    if library.call("gs2d_adam", attributes, len(updates), beta1, beta2, eps) != 0:
         raise ShapeError("rows must be row indices of the parameter, got an index out of range")
     del alive
 
@@ -134,6 +131,5 @@ def first_not_finite(tensors: Sequence[Tensor], *, library: Library | None = Non
     count = len(plain)
     pointers = (ctypes.c_void_p * count)(*(tensor.data_ptr() for tensor in plain))
     sizes = (ctypes.c_int64 * count)(*(tensor.numel() for tensor in plain))
-    function = library.function("gs2d_first_not_finite", ctypes.c_int, (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int))
-    first = int(function(pointers, sizes, count))
+    first = int(library.call("gs2d_first_not_finite", pointers, sizes, count))
     return None if first == count else first

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
 
-from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import load
-
-__all__ = ["CollapseArrays", "CollapseRules", "collapse"]
 
 _CANDIDATE_BYTES = 24  # of cpu/collapse.cpp
 
@@ -82,7 +78,6 @@ class CollapseArrays:
 
 def collapse(arrays: CollapseArrays, rules: CollapseRules) -> None:
     """Collapse edges in place, with 180 bytes per face of temporary memory."""
-    library = load()
     count, faces = len(arrays.points), len(arrays.corners)
     capacity = 3 * faces  # edges of separate triangles
     work = {name: np.empty(count, np.int32) for name in ("head", "tail", "stamp", "mark")}
@@ -90,6 +85,4 @@ def collapse(arrays: CollapseArrays, rules: CollapseRules) -> None:
     work["heap"] = np.empty(capacity * _CANDIDATE_BYTES, np.uint8)
     inputs = {field.name: getattr(arrays, field.name) for field in fields(arrays)}
     sizes = {"vertices": count, "faces": faces, "capacity": capacity}
-    kind = structure("CollapseArguments", "cpu/collapse.cpp")
-    arguments = filled(kind, **sizes, **rules._asdict(), **inputs, **work)
-    library.function("gs2d_collapse", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    load().call("gs2d_collapse", **sizes, **rules._asdict(), **inputs, **work)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import library_for
-
-__all__ = ["SeenSpace", "look_at_free_space"]
 
 
 class SeenSpace(NamedTuple):
@@ -66,7 +62,5 @@ def look_at_free_space(ends: Tensor, reach: Tensor, seen: SeenSpace, against: Te
     height, width = seen.limit.shape
     sizes = {"count": ends.shape[1], "places": len(ends), "height": height, "width": width}
     limits = {"radius": seen.radius, "fraction": seen.fraction}
-    kind = structure("FreeSpaceArguments", "cpu/free_space.cpp")
-    arguments = filled(kind, **sizes, **limits, **given, against=against, support=support)
-    library.function("gs2d_free_space", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    library.call("gs2d_free_space", **sizes, **limits, **given, against=against, support=support)
     return True

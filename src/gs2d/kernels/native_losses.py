@@ -6,7 +6,6 @@ returns it in the backward pass. Another cotangent also gives the correct gradie
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from typing import Any
 
@@ -18,22 +17,9 @@ from gs2d.core.checks import check_shapes
 from gs2d.kernels.library import Library, ready_library
 from gs2d.kernels.loss_operations import LossOperations, NormalOptions
 
-__all__ = ["NativeLosses"]
-
-POINTER, INT64, DOUBLE, INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_int
-SIGNATURES: dict[str, list[Any]] = {
-    "gs2d_photometric": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] * 3 + [POINTER] * 2,
-    "gs2d_blur": [POINTER] + [INT64] * 2 + [POINTER],
-    "gs2d_masked_mean": [POINTER] * 2 + [INT64] * 2 + [POINTER],
-    "gs2d_normal_smoothness": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] + [POINTER] * 2,
-    "gs2d_normal_consistency": [POINTER] * 7 + [INT64] * 2 + [INT, INT, DOUBLE] + [POINTER] * 4,
-}
-
 
 def _call(library: Library, name: str, *arguments: Any) -> None:
-    """Call an exported function with the addresses of tensors; None becomes null."""
-    pointers = [x.data_ptr() if isinstance(x, Tensor) else x for x in arguments]
-    if library.function(name, INT, SIGNATURES[name])(*pointers) != 0:
+    if library.call(name, *arguments) != 0:
         raise MemoryError(f"{name} could not allocate its scratch rows")
 
 

@@ -8,22 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.kernels.c_structures import filled, structure
+from gs2d.kernels.c_structures import structure
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
-
-__all__ = [
-    "PLANES",
-    "VISIBLE",
-    "WARPED",
-    "GatherArguments",
-    "MatchArguments",
-    "draw_on_cpu",
-    "gather_on_cpu",
-    "lens_of",
-    "match_on_cpu",
-]
 
 PLANES = 7  # images in the workspace of a comparison
 WARPED, VISIBLE = 0, 2  # of them: the neighbour as the view sees it, and where (1 or 0)
@@ -56,15 +44,13 @@ def draw_on_cpu(
     arrays = {"positions": vertices, "corners": faces, "flat": flat, "face": face, "depth": depth}
     sizes = {"vertices": len(vertices), "faces": len(faces), "width": camera.width, "height": camera.height}
     pose = tuple(camera.T_cam_world[:3].ravel())
-    kind = structure("RasterArguments", "cpu/refine.cpp")
-    arguments = filled(kind, **arrays, **sizes, lens=lens_of(camera), pose=pose, near=near)
-    library.function("gs2d_raster_mesh", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    library.call("gs2d_raster_mesh", **arrays, **sizes, lens=lens_of(camera), pose=pose, near=near)
     return face, depth
 
 
 def gather_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
     """Add derivatives by pixel depth to the vertices."""
-    library.function("gs2d_gather_vertices", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    library.call("gs2d_gather_vertices", arguments)
 
 
 def match_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
@@ -75,6 +61,5 @@ def match_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
     MemoryError
         If the rows of a window do not fit into memory.
     """
-    call = library.function("gs2d_match_views", ctypes.c_int, [ctypes.c_void_p])
-    if call(ctypes.byref(arguments)) != 0:
+    if library.call("gs2d_match_views", arguments) != 0:
         raise MemoryError("gs2d_match_views could not allocate its rows")

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import numpy as np
 
 from gs2d.errors import ProtocolError
-from gs2d.kernels.c_structures import filled, structure
+from gs2d.kernels.c_structures import arguments_of
 from gs2d.kernels.library import Library
-
-__all__ = ["minimum_cut_on_cpu", "tetrahedra_on_cpu", "votes_on_cpu"]
 
 ROWS_A_POINT = 9  # tetrahedra; samples of a surface have six to seven
 
@@ -27,9 +23,8 @@ def tetrahedra_on_cpu(library: Library, grid: np.ndarray, order: np.ndarray) -> 
         corners, neighbours = np.empty((capacity, 4), np.int32), np.empty((capacity, 4), np.int32)
         inserted = np.zeros(len(grid), np.uint8)
         arrays = {"xyz": grid, "order": order, "corners": corners, "neighbours": neighbours, "inserted": inserted}
-        kind = structure("TetrahedraArguments", "cpu/tetrahedra.cpp")
-        arguments = filled(kind, **arrays, points=len(grid), capacity=capacity)
-        library.function("gs2d_tetrahedra", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+        arguments = arguments_of("gs2d_tetrahedra", **arrays, points=len(grid), capacity=capacity)
+        library.call("gs2d_tetrahedra", arguments)
         if arguments.count >= 0:
             break
         count *= 2
@@ -46,9 +41,7 @@ def votes_on_cpu(library: Library, arrays: dict[str, np.ndarray], surfaces: int)
     ``arrays`` has the names and types of the fields of ``VoteArguments``; ``facets``, ``full`` and ``cameras`` change
     in place.
     """
-    kind = structure("VoteArguments", "cpu/visibility_votes.cpp")
-    arguments = filled(kind, lines=len(arrays["ends"]), surfaces=surfaces, **arrays)
-    library.function("gs2d_votes", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    library.call("gs2d_votes", lines=len(arrays["ends"]), surfaces=surfaces, **arrays)
 
 
 def minimum_cut_on_cpu(
@@ -57,9 +50,8 @@ def minimum_cut_on_cpu(
     """Return the source side [N] bool and the flow; ``capacity`` and ``terminal`` become what is left."""
     side = np.zeros(len(neighbours), np.uint8)
     arrays = {"neighbours": neighbours, "mirror": mirror, "capacity": capacity, "terminal": terminal}
-    kind = structure("CutArguments", "cpu/minimum_cut.cpp")
-    arguments = filled(kind, **arrays, source_side=side, nodes=len(neighbours))
-    library.function("gs2d_minimum_cut", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    arguments = arguments_of("gs2d_minimum_cut", **arrays, source_side=side, nodes=len(neighbours))
+    library.call("gs2d_minimum_cut", arguments)
     if arguments.flow < 0:
         raise ProtocolError("the minimum cut needs more memory than there is; a lower --memory makes fewer points")
     return side.astype(bool), int(arguments.flow)

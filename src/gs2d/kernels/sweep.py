@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,10 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.kernels.c_structures import filled, structure
 from gs2d.kernels.library import library_for
-
-__all__ = ["BestPlanes", "sweep_planes"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +73,7 @@ def sweep_planes(
     plane = torch.zeros(height, width, dtype=torch.int32)
     outputs = {"best": best, "plane": plane, "before": before, "after": after}
     counts = {"height": height, "width": width, "planes": len(depths), "neighbours": len(images), "radius": radius}
-    kind = structure("SweepArguments", "cpu/sweep.cpp")
-    arguments = filled(kind, **counts, **inputs, **outputs, others=addresses, sizes=sizes, noise=noise)
-    if not library.function("gs2d_sweep", ctypes.c_int, [ctypes.c_void_p])(ctypes.byref(arguments)):
+    others_of = {"others": addresses, "sizes": sizes}
+    if not library.call("gs2d_sweep", **counts, **inputs, **outputs, **others_of, noise=noise):
         raise MemoryError("no memory for a plane sweep")
     return BestPlanes(best, plane.long(), before, after)

@@ -12,8 +12,6 @@ from torch.optim.adam import adam
 
 from gs2d.kernels.native_adam import AdamUpdate
 
-__all__ = ["accumulate", "adam_step", "finite", "first_not_finite"]
-
 
 @torch.no_grad()
 def adam_step(updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:

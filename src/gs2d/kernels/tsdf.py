@@ -22,14 +22,6 @@ if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
     from gs2d.kernels.library import Library
 
-__all__ = [
-    "FusionOnDevice",
-    "arguments_of",
-    "fuse_on_cpu",
-    "fuse_on_gpu",
-    "mark_on_cpu",
-]
-
 VOXELS = 512  # per block
 
 
@@ -71,9 +63,7 @@ def mark_on_cpu(
     rays, depth, offsets = (np.ascontiguousarray(a, np.float64) for a in (rays, depth, offsets))
     arrays = {"rays": rays, "depth": depth, "offsets": offsets, "marks": marks}
     grid = {"start": tuple(start), "end": tuple(end), "padded": marks.shape}
-    kind = structure("MarkArguments", "core/fuse.h")
-    arguments = filled(kind, **arrays, **grid, count=len(depth), steps=len(offsets))
-    library.function("gs2d_mark_blocks", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    library.call("gs2d_mark_blocks", **arrays, **grid, count=len(depth), steps=len(offsets))
 
 
 def arguments_of(
@@ -109,7 +99,7 @@ def fuse_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
         raise BackendError(
             f"depth maps are fused in float32, got the {library.variant} kernels; unset GS2D_CPU_VARIANT"
         )
-    library.function("gs2d_fuse", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    library.call("gs2d_fuse", arguments)
 
 
 def fuse_on_gpu(launcher: Launcher, arguments: ctypes.Structure) -> None:

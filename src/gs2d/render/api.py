@@ -108,8 +108,6 @@ from gs2d.render.types import (
     RenderOutput,
 )
 
-__all__ = ["first_contributors", "rasterize", "rasterize_features", "splat_errors", "splat_sums"]
-
 
 def rasterize(
     splats: Splats,

@@ -28,8 +28,6 @@ from gs2d.render.whole_step import WholeStep
 if TYPE_CHECKING:
     from gs2d.render.cpu_cached import CachedView
 
-__all__ = ["BACKENDS", "Backend", "BackendStatus", "backend_report", "get_backend", "register_backend"]
-
 T = TypeVar("T")
 
 BACKENDS: Registry[Callable[[], Backend]] = Registry(

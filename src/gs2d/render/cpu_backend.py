@@ -9,23 +9,42 @@ import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera
-from gs2d.core.splats import Splats
+from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
 from gs2d.errors import BackendError
 from gs2d.kernels import densify_stats, library, native_adam
+from gs2d.kernels.library import Library
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.native_losses import NativeLosses
 from gs2d.render import cpu_cached
-from gs2d.render.backends import Backend, BackendStatus, register_backend
+from gs2d.render.backends import BackendStatus, register_backend
 from gs2d.render.cpu_cached import CachedView
-from gs2d.render.native_rasterizer import rasterize_with, splat_errors_with
-from gs2d.render.types import Features, RasterSettings, RenderOutput
-
-__all__ = ["CpuBackend"]
+from gs2d.render.cpu_passes import (
+    Channels,
+    Frame,
+    ImageGradients,
+    Images,
+    ParameterGradients,
+    address_of,
+    forward,
+    parameters_of,
+    run,
+    view_of,
+    with_features,
+)
+from gs2d.render.kernel_backend import Gradients, KernelBackend, ViewOfSplats, plain
+from gs2d.render.types import Features, RasterSettings
 
 
 @register_backend("cpu")
-class CpuBackend(Backend):
-    """The native library: SIMD and threads; float32.
+class CpuBackend(KernelBackend):
+    """The native library: SIMD and threads. Bit-identical for any number of threads on one machine and version.
+
+    Parameters
+    ----------
+    chosen : Library, optional
+        Renders with this variant and its dtype and number of threads (tests).
+    exact_masks : bool
+        False disables culling inside tiles, and of splats without an ellipse; no bit of the image changes (tests).
 
     Raises
     ------
@@ -36,48 +55,58 @@ class CpuBackend(Backend):
     name = "cpu"
     caches_views = True
 
-    def __init__(self) -> None:
-        library.load()
+    def __init__(self, chosen: Library | None = None, *, exact_masks: bool = True) -> None:
+        self.dtype = (chosen or library.load()).dtype
+        self._chosen, self._exact_masks = chosen, exact_masks
 
-    def rasterize(
-        self,
-        splats: Splats,
-        camera: Camera,
-        settings: RasterSettings,
-        screen_probe: Tensor | None = None,
-        gradient_rows: Tensor | None = None,
-    ) -> RenderOutput:
-        """Render one view; gradients that are not needed cost nothing."""
-        return rasterize_with(library.ready_library(), splats, camera, settings, screen_probe, gradient_rows)
+    def _library(self) -> Library:
+        return self._chosen or library.ready_library()
 
-    def rasterize_features(
-        self,
-        splats: Splats,
-        camera: Camera,
-        settings: RasterSettings,
-        features: Features,
-        screen_probe: Tensor | None = None,
-    ) -> RenderOutput:
-        """Render one view with further channels."""
-        return rasterize_with(library.ready_library(), splats, camera, settings, screen_probe, features=features)
+    def empty(self, shape: tuple[int, ...], device: torch.device) -> Tensor:
+        """Allocate a tensor for a gradient in the library's pool."""
+        return (self._chosen or library.load()).pool.empty(shape, self.dtype)
 
-    def splat_errors(
-        self,
-        splats: Splats,
-        camera: Camera,
-        image: Tensor,
-        settings: RasterSettings,
-        mask: Tensor | None = None,
-        occlusion: bool = False,
-    ) -> Tensor:
-        """Return the summed colour error of each splat [N]."""
-        return splat_errors_with(library.ready_library(), splats, camera, image, settings, mask, occlusion)
+    def forward_pass(
+        self, scene: ViewOfSplats, features: Features | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Frame]:
+        """Render one view."""
+        camera, settings, splats = scene
+        depth_width = settings.depth_width(camera) if settings.with_transmittance_depth else None
+        view = view_of(camera, settings, self._exact_masks)
+        images, frame = forward(self._library(), view, splats, depth_width)
+        if features is not None:
+            images["color"] = with_features(frame, images["color"], features)
+        return images, {}, frame
+
+    def backward_pass(self, state: Frame, given: Gradients) -> None:
+        """Compute gradients of the last forward pass; the work for other rows is skipped."""
+        saved, wanted, probe = given.saved, given.wanted, given.wanted["probe"]
+        images = Images(*(address_of(saved[name]) for name in (*IMAGES, "radii")))
+        upstream = ImageGradients(*(address_of(given.upstream.get(name)) for name in (*IMAGES, "depth_transmittance")))
+        outputs = (address_of(wanted[name]) for name in (*ATTRIBUTES, "probe"))
+        out = ParameterGradients(*outputs, 0 if probe is None else probe.shape[1], address_of(given.rows))
+        arguments = (state.pointer, parameters_of(saved), images, upstream, out, wanted["intrinsics"])
+        if given.wide is None:
+            run(state.library, "gs2d_raster_backward_intrinsics", *arguments)
+            return
+        tensors = (saved["values"], saved["background"], *given.wide, wanted["values"])
+        channels = Channels(saved["values"].shape[1], *map(address_of, tensors))
+        run(state.library, "gs2d_raster_backward_features", *arguments, channels)
+
+    def errors_pass(self, scene: ViewOfSplats, image: Tensor, mask: Tensor | None, occlusion: bool) -> Tensor:
+        """Return the splat errors [N] of one view."""
+        found = torch.empty(len(scene.splats["means"]), dtype=self.dtype)
+        view = view_of(scene.camera, scene.settings, self._exact_masks)
+        run(self._library(), "gs2d_splat_errors", view, parameters_of(scene.splats), image, mask, occlusion, found)
+        return found
 
     def cache_view(
         self, splats: Splats, camera: Camera, settings: RasterSettings, rows: Tensor, *, limit_bytes: int
     ) -> CachedView | None:
         """Cache a view in which only the colours of ``rows`` change; None if it exceeds ``limit_bytes``."""
-        return cpu_cached.cache_view(splats, camera, settings, rows, limit_bytes=limit_bytes)
+        self.check(splats, settings)
+        tensors = plain(splats.items())
+        return cpu_cached.cache_view(self._library(), camera, settings, tensors, rows, limit_bytes)
 
     def loss_operations(self, device: torch.device) -> NativeLosses:
         """Return the fused operations for the losses."""

@@ -8,7 +8,7 @@ summation order, and do not depend on the number of threads (``docs/math.md``, "
 
 from __future__ import annotations
 
-import ctypes
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -17,21 +17,12 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
-from gs2d.core.splats import Splats
+from gs2d.core.splats import ATTRIBUTES
 from gs2d.errors import ShapeError
 from gs2d.kernels.c_structures import filled, structure
-from gs2d.kernels.library import Library, ready_library
-from gs2d.render.native_rasterizer import (
-    ParameterGradients,
-    address_of,
-    check_tensors,
-    parameters_of,
-    render_forward,
-    view_of,
-)
+from gs2d.kernels.library import Library
+from gs2d.render.cpu_passes import ParameterGradients, forward, parameters_of, view_of
 from gs2d.render.types import RasterSettings
-
-__all__ = ["CachedView", "cache_view"]
 
 TILE, SH_MAX = 16, 16  # px per side of a tile; basis functions of degree 3 (kernels/core/sh.h)
 
@@ -56,7 +47,7 @@ class CachedView:
         self.rows, self.arrays = rows, arrays
         sizes = {"width": self.width, "height": self.height, "tiles_x": -(-self.width // TILE)}
         sizes |= {"tiles": len(arrays["tile_entries"]) - 1, "rows": rows, "degree": degree}
-        self._native = filled(structure("CachedView", "cpu/cached.cpp"), **sizes, **arrays)
+        self.native = filled(structure("CachedView", "cpu"), **sizes, **arrays)
 
     @property
     def nbytes(self) -> int:
@@ -77,7 +68,7 @@ class CachedView:
             If the number of rows or coefficients or the dtype differ from the cached ones.
         """
         check_shapes({"sh0": (sh0, "M 1 3"), "shN": (shN, "M K 3")})
-        degree = int(self._native.degree)
+        degree = int(self.native.degree)
         if len(sh0) != self.rows or shN.shape[1] + 1 < (degree + 1) ** 2:
             raise ShapeError(
                 f"the cached view holds {self.rows} rows of degree {degree}, got {len(sh0)} rows with "
@@ -87,86 +78,67 @@ class CachedView:
         image: Tensor = _Render.apply(self, sh0, shN)
         return image
 
-    def _render(self, sh0: Tensor, shN: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the image and the rows' colours [M, 4]."""
-        image = torch.empty(self.height, self.width, 3, dtype=sh0.dtype)
-        colors = torch.empty(self.rows, 4, dtype=sh0.dtype)
-        splats = parameters_of((sh0, sh0, sh0, sh0, sh0, shN))  # only the coefficients are read
-        render = self.library.function("gs2d_cached_render", None, [ctypes.c_void_p] * 4)
-        render(ctypes.byref(self._native), ctypes.byref(splats), address_of(colors), address_of(image))
-        return image, colors
-
-    def _gradients(self, upstream: Tensor, colors: Tensor, shN: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradients of sh0 and shN from the gradient of the image."""
-        sh0_gradient = torch.empty(self.rows, 1, 3, dtype=shN.dtype)
-        shN_gradient = torch.empty_like(shN)
-        slots = torch.empty(len(self.arrays["entry_row"]), 4, dtype=shN.dtype)
-        out = filled(ParameterGradients, sh0=sh0_gradient, shN=shN_gradient)
-        types = [*[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_void_p] * 2]
-        gradients = self.library.function("gs2d_cached_gradients", None, types)
-        given = (address_of(upstream), address_of(colors), shN.shape[1], address_of(slots))
-        gradients(ctypes.byref(self._native), *given, ctypes.byref(out))
-        return sh0_gradient, shN_gradient
-
 
 class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, view: CachedView, sh0: Tensor, shN: Tensor) -> Tensor:
-        tensors = (sh0.detach().contiguous(), shN.detach().contiguous())
-        image, colors = view._render(*tensors)
+        sh0, shN = sh0.detach().contiguous(), shN.detach().contiguous()
+        image = torch.empty(view.height, view.width, 3, dtype=sh0.dtype)
+        colors = torch.empty(view.rows, 4, dtype=sh0.dtype)
+        splats = parameters_of(dict.fromkeys(ATTRIBUTES, sh0) | {"shN": shN})  # only the coefficients are read
+        view.library.call("gs2d_cached_render", view.native, splats, colors, image)
         ctx.view = view
-        ctx.save_for_backward(colors, tensors[1])
+        ctx.save_for_backward(colors, shN)
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return (None, *ctx.view._gradients(upstream.contiguous(), *ctx.saved_tensors))
+        view, (colors, shN) = ctx.view, ctx.saved_tensors
+        sh0_gradient, shN_gradient = colors.new_empty(view.rows, 1, 3), torch.empty_like(shN)
+        slots = colors.new_empty(len(view.arrays["entry_row"]), 4)
+        out = filled(ParameterGradients, sh0=sh0_gradient, shN=shN_gradient)
+        given = (view.native, upstream.contiguous(), colors, shN.shape[1], slots, out)
+        view.library.call("gs2d_cached_gradients", *given)
+        return None, sh0_gradient, shN_gradient
 
 
 def cache_view(
-    splats: Splats,
+    library: Library,
     camera: Camera,
     settings: RasterSettings,
+    splats: Mapping[str, Tensor],
     rows: Tensor,
-    *,
     limit_bytes: int,
-    library: Library | None = None,
 ) -> CachedView | None:
     """Cache one view of splats of which only the colours of ``rows`` change.
 
     Parameters
     ----------
-    splats : Splats
-        N splats; the colours of ``rows`` do not matter.
+    library : Library
     camera : Camera
     settings : RasterSettings
+    splats : mapping of str to Tensor
+        The contiguous parameters of N splats by name; the colours of ``rows`` do not matter.
     rows : Tensor [M] int64
         Rows whose colours change, each once.
     limit_bytes : int
-    library : Library, optional
-        Default: ``ready_library()``.
 
     Returns
     -------
     CachedView or None
         None if it exceeds ``limit_bytes``; its size depends only on the arguments.
     """
-    library = library or ready_library()
-    check_tensors(splats, settings, library.dtype)
     if settings.sh_degree < 0:
         raise ShapeError("a cached view needs colours from harmonics, got plain colours (sh_degree -1)")
     height, width, count = camera.height, camera.width, len(rows)
-    view = view_of(camera, settings, True)
-    tensors = [t.detach().contiguous() for _, t in splats.items()]
-    frame = render_forward(library, view, tensors)[-1]
-    row_of = torch.full((len(splats),), -1, dtype=torch.int32)
+    frame = forward(library, view_of(camera, settings, True), splats)[1]
+    row_of = torch.full((len(splats["means"]),), -1, dtype=torch.int32)
     row_of[rows] = torch.arange(count, dtype=torch.int32)
 
     tiles = -(-width // TILE) * -(-height // TILE)
     tile_entries, tile_blocks = (torch.empty(tiles + 1, dtype=torch.int64) for _ in range(2))
-    measure = library.function("gs2d_cached_measure", None, [ctypes.c_void_p] * 4)
-    measure(frame.pointer, *(address_of(t) for t in (row_of, tile_entries, tile_blocks)))
+    library.call("gs2d_cached_measure", frame.pointer, row_of, tile_entries, tile_blocks)
     entries, blocks = int(tile_entries[-1]), int(tile_blocks[-1])
     sizes: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
         "entry_row": ((entries,), torch.int32),
@@ -183,7 +155,6 @@ def cache_view(
     arrays = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in sizes.items()}
     arrays |= {"tile_entries": tile_entries, "tile_blocks": tile_blocks}
     cached = CachedView(library, (height, width), settings.sh_degree, count, arrays)
-    fill = library.function("gs2d_cached_fill", None, [ctypes.c_void_p] * 4)
-    learning = [t[rows] for t in tensors]
-    fill(frame.pointer, address_of(row_of), ctypes.byref(parameters_of(learning)), ctypes.byref(cached._native))
+    learning = {name: tensor[rows] for name, tensor in splats.items()}
+    library.call("gs2d_cached_fill", frame.pointer, row_of, parameters_of(learning), cached.native)
     return cached

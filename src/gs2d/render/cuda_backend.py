@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from gs2d.core.camera import Camera
-from gs2d.core.splats import Splats
+from gs2d.core.splats import ATTRIBUTES, IMAGES
 from gs2d.kernels import torch_kernels
 from gs2d.kernels.cuda import cuda_adam, diagnose, launch
 from gs2d.kernels.cuda.cuda_losses import CudaLosses
+from gs2d.kernels.cuda.launch import Launcher
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.tsdf import FusionOnDevice
-from gs2d.render.backends import Backend, register_backend
-from gs2d.render.cuda_rasterizer import CudaChoices, rasterize_with, splat_errors_with
+from gs2d.render.backends import register_backend
+from gs2d.render.cuda_passes import (
+    CHANNELS,
+    HIDDEN,
+    SAVED,
+    ForwardState,
+    backward,
+    blend_features,
+    errors,
+    forward,
+    view_of,
+)
 from gs2d.render.cuda_step import Stepper
+from gs2d.render.kernel_backend import Gradients, KernelBackend, ViewOfSplats
 from gs2d.render.pair_budget import PairBudget
-from gs2d.render.types import Features, RasterSettings, RenderOutput
+from gs2d.render.types import Features
 from gs2d.render.whole_step import WholeStep
-
-__all__ = ["CudaBackend"]
 
 T = TypeVar("T")
 
 
 @register_backend("cuda")
-class CudaBackend(Backend):
+class CudaBackend(KernelBackend):
     """The CUDA kernels.
 
     Training does not wait for the device: instead of reading the number of pairs of splat and tile, a rendering
@@ -40,13 +50,28 @@ class CudaBackend(Backend):
     ----------
     budget : PairBudget, optional
         None: each rendering waits for its number of pairs.
+    launcher : Launcher, optional
+        Runs the kernels; default: that of the tensors' device.
+    exact_masks : bool
+        False disables culling inside tiles; no bit of the image may change (tests).
+    deterministic : bool, optional
+        The same gradients bit for bit from run to run. Costs one more pass and 320 bytes for each pair of splat and
+        tile, and 16 more bytes for each further channel. None: as torch.use_deterministic_algorithms says.
     """
 
     name = "cuda"
     device = "cuda"
 
-    def __init__(self, budget: PairBudget | None = None) -> None:
-        self._budget = budget
+    def __init__(
+        self,
+        budget: PairBudget | None = None,
+        *,
+        launcher: Launcher | None = None,
+        exact_masks: bool = True,
+        deterministic: bool | None = None,
+    ) -> None:
+        self._budget, self._given = budget, launcher
+        self._exact_masks, self._deterministic = exact_masks, deterministic
         self._last: tuple[Callable[[], Any], Callable[[], None]] | None = None  # the iteration that may be repeated
         self._stepper: Stepper | None = None
 
@@ -57,56 +82,81 @@ class CudaBackend(Backend):
         ready.about = _machine()
         return ready
 
-    def rasterize(
-        self,
-        splats: Splats,
-        camera: Camera,
-        settings: RasterSettings,
-        screen_probe: Tensor | None = None,
-        gradient_rows: Tensor | None = None,
-    ) -> RenderOutput:
-        """Render one view on the device of the splats."""
-        view = (splats, camera, settings, screen_probe, gradient_rows)
-        return rasterize_with(launch.launcher_for(splats.device), *view, choices=CudaChoices(budget=self._budget))
+    def _launcher(self, device: torch.device) -> Launcher:
+        return self._given or launch.launcher_for(device)
 
-    def rasterize_features(
-        self,
-        splats: Splats,
-        camera: Camera,
-        settings: RasterSettings,
-        features: Features,
-        screen_probe: Tensor | None = None,
-    ) -> RenderOutput:
-        """Render one view with further channels."""
-        launcher, choices = launch.launcher_for(splats.device), CudaChoices(budget=self._budget)
-        return rasterize_with(launcher, splats, camera, settings, screen_probe, features=features, choices=choices)
+    def forward_pass(
+        self, scene: ViewOfSplats, features: Features | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Any]:
+        """Render one view, deterministically."""
+        settings, launcher = scene.settings, self._launcher(scene.splats["means"].device)
+        sure = torch.are_deterministic_algorithms_enabled() if self._deterministic is None else self._deterministic
+        frame = forward(
+            launcher,
+            view_of(scene.camera, settings),
+            scene.splats,
+            exact=self._exact_masks,
+            distortion=settings.with_distortion,
+            transmittance=settings.with_transmittance_depth,
+            whole_lists=features is not None,
+            budget=self._budget,
+        )
+        hidden = frame.images | {name: getattr(frame, name) for name in SAVED}
+        outputs = {name: hidden.pop(name) for name in IMAGES} | {"radii": frame.radii}
+        if settings.with_transmittance_depth:
+            outputs["depth_transmittance"] = hidden.pop("depth_transmittance")
+        if features is not None:
+            blended = blend_features(launcher, frame, *_padded(features.values, features.background))
+            further = blended[: features.values.shape[1]].permute(1, 2, 0)
+            outputs["color"] = torch.cat([outputs["color"], further], dim=2)
+        return outputs, hidden, (launcher, frame.view, sure)
 
-    def splat_errors(
-        self,
-        splats: Splats,
-        camera: Camera,
-        image: Tensor,
-        settings: RasterSettings,
-        mask: Tensor | None = None,
-        occlusion: bool = False,
-    ) -> Tensor:
-        """Return the summed colour error of each splat [N]."""
-        launcher = launch.launcher_for(splats.device)
-        return splat_errors_with(launcher, splats, camera, image, settings, mask, occlusion)
+    def backward_pass(self, state: Any, given: Gradients) -> None:
+        """Compute gradients of a forward pass; if only colours have some, a shorter pass runs.
+
+        They are summed by atomic additions, so on a GPU their last digits vary from run to run, unless
+        ``deterministic``.
+        """
+        launcher, view, sure = state
+        saved, wanted, further, to_values = given.saved, dict(given.wanted), None, None
+        splats = {name: saved[name] for name in ATTRIBUTES}
+        images = {name: saved[name] for name in (*IMAGES, *HIDDEN)}
+        frame = ForwardState(view=view, images=images, radii=saved["radii"], **{name: saved[name] for name in SAVED})
+        upstream: dict[str, Tensor | None] = dict.fromkeys((*IMAGES, "depth_transmittance")) | dict(given.upstream)
+        if len(saved["moments"]) == 0:
+            upstream["distortion"] = None  # a constant
+        values = wanted.pop("values")
+        if given.wide is not None:
+            further, to_values = _further(saved, given.wide)
+        if wanted["intrinsics"] is not None:
+            wanted["intrinsics"].zero_()
+        backward(launcher, frame, splats, upstream, wanted, learns=given.rows, deterministic=sure, features=further)
+        if values is not None and to_values is not None:
+            values.copy_(to_values[:, : values.shape[1]])
+
+    def errors_pass(self, scene: ViewOfSplats, image: Tensor, mask: Tensor | None, occlusion: bool) -> Tensor:
+        """Return the splat errors [N] of one view, deterministic.
+
+        With ``occlusion``, an error above 1e9 within 8x8 pixels counts as 1e9.
+        """
+        view = view_of(scene.camera, scene.settings)
+        return errors(self._launcher(image.device), view, scene.splats, image, mask, occlusion)
 
     def loss_operations(self, device: torch.device) -> CudaLosses:
         """Return the fused operations for the losses; caching the local mean of a target would save no time."""
-        return CudaLosses(launch.launcher_for(device))
+        return CudaLosses(self._launcher(device))
 
     def fusion(self) -> FusionOnDevice:
         """Return what fuses depth maps into volumes."""
         device = torch.device(self.device)
-        return FusionOnDevice(launch.launcher_for(device), device)
+        return FusionOnDevice(self._launcher(device), device)
 
     def for_training(self) -> CudaBackend:
         """Return a backend with a budget; torch's memory segments may grow from now on."""
         launch.grow_in_place()
-        return type(self)(PairBudget())
+        return type(self)(
+            PairBudget(), launcher=self._given, exact_masks=self._exact_masks, deterministic=self._deterministic
+        )
 
     def iterate(self, update: Callable[[], T], *, rollback: Callable[[], None], exact: bool) -> T:
         """Run an iteration; first repeat the previous one if it lacked pairs."""
@@ -138,7 +188,7 @@ class CudaBackend(Backend):
         if self._stepper is None:
             launch.steps()  # refuses an unknown value before anything is done
             device = step.splats.device
-            self._stepper = Stepper(launch.launcher_for(device), device)
+            self._stepper = Stepper(self._launcher(device), device)
         return self._stepper.run(step, self._budget)
 
     def _overflow(self) -> Tensor | None:
@@ -149,8 +199,7 @@ class CudaBackend(Backend):
         """Run one Adam step on several attributes in one launch."""
         if not updates:
             return
-        launcher = launch.launcher_for(updates[0].parameter.device)
-        betas = {"beta1": beta1, "beta2": beta2, "eps": eps}
+        launcher, betas = self._launcher(updates[0].parameter.device), {"beta1": beta1, "beta2": beta2, "eps": eps}
         cuda_adam.adam_step(updates, **betas, launcher=launcher, skip=self._overflow())
 
     def accumulate(self, signed: Tensor, absolute: Tensor, count: Tensor, signal: Tensor, radii: Tensor) -> None:
@@ -174,3 +223,16 @@ class CudaBackend(Backend):
 def _machine() -> str:
     """Return a line about this machine, or raise BackendError."""
     return diagnose.machine()
+
+
+def _padded(*tensors: Tensor) -> list[Tensor]:
+    """Return tensors [..., F] with zeros up to a multiple of ``CHANNELS``."""
+    return [pad(tensor, (0, -tensor.shape[-1] % CHANNELS)) for tensor in tensors]
+
+
+def _further(saved: Mapping[str, Tensor], wide: tuple[Tensor, Tensor]) -> tuple[list[Tensor], Tensor]:
+    """Return the features of ``cuda_passes.backward``, and of them the gradients of the values."""
+    values, background = _padded(saved["values"], saved["background"])
+    planes = [image.permute(2, 0, 1).contiguous() for image in _padded(*(image[..., 3:] for image in wide))]
+    to_values = torch.zeros_like(values)
+    return [values, background, *planes, to_values], to_values

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera
-from gs2d.core.splats import ATTRIBUTES, IMAGES
+from gs2d.core.splats import IMAGES
 from gs2d.errors import BackendError
 from gs2d.kernels.c_structures import filled
 from gs2d.kernels.cuda.kernel_arguments import cuda_structure, fill, work_of
@@ -36,25 +36,14 @@ from gs2d.render.cuda_works import (
 from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, Rendering, room_for
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 
-__all__ = [
-    "CHANNELS",
-    "DEPTH",
-    "IMAGES",
-    "ForwardState",
-    "RequestedGradients",
-    "backward",
-    "blend_features",
-    "errors",
-    "forward",
-    "view_of",
-]
-
 TILE = 16
 CHANNELS = 8  # pixels.h: further channels are padded to a multiple of this
 MAX_SPLATS = 1 << 24  # an entry stores the splat in 24 bits
 MAX_SLOTTED = 1 << 30  # four slots each, indexed with 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
 DEPTH = ("depth_transmittance", "slope")  # empty unless that depth was requested
+HIDDEN = ("final_T", "moments", *DEPTH)  # images that are not always returned
+SAVED = ("records", "tile_counts", "entries", "ranges", "tiles", "pieces", "seen", "order", "ends", "permutation")
 LISTS = ("records", "entries", "ranges", "tiles", "seen")
 PROJECTED = {
     "records": (16, torch.float32),
@@ -121,11 +110,7 @@ class ForwardState:
 
 
 def view_of(camera: Camera, settings: RasterSettings) -> ctypes.Structure:
-    """Return the view structure of the kernels; BackendError for a setting that only the reference backend supports."""
-    if settings.lowpass_depth != "center":
-        raise BackendError(
-            f"the cuda backend needs lowpass_depth 'center', got {settings.lowpass_depth!r}; use --backend reference"
-        )
+    """Return the view structure of the kernels."""
     view = cuda_structure("View")()
     view.camera.R[:] = np.asarray(camera.rotation).ravel().tolist()
     view.camera.t[:] = np.asarray(camera.T_cam_world[:3, 3]).tolist()
@@ -154,15 +139,11 @@ def _run(launcher: Launcher, view: ctypes.Structure, work: Work) -> None:
     launcher.launch(work.name, work.blocks, work.threads, work.arguments)
 
 
-def _named(parameters: Sequence[Tensor]) -> dict[str, Tensor]:
-    return dict(zip(ATTRIBUTES, parameters, strict=True))
-
-
 def _project(
-    launcher: Launcher, view: ctypes.Structure, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
+    launcher: Launcher, view: ctypes.Structure, splats: Mapping[str, Tensor], *, errors: bool, exact: bool = True
 ) -> dict[str, Tensor]:
     """Return the outputs of project.cu; records, cull and rects of splats without tiles are undefined."""
-    count, device = parameters[0].shape[0], parameters[0].device
+    count, device = len(splats["means"]), splats["means"].device
     if count >= MAX_SPLATS:
         raise BackendError(f"the cuda backend takes fewer than {MAX_SPLATS} splats, got {count}")
     projected = {
@@ -170,14 +151,14 @@ def _project(
         for name, (columns, dtype) in PROJECTED.items()
     }
     if count > 0:
-        _run(launcher, view, project(_named(parameters), projected, errors=errors, exact=exact))
+        _run(launcher, view, project(splats, projected, errors=errors, exact=exact))
     return projected
 
 
 def forward(
     launcher: Launcher,
     view: ctypes.Structure,
-    parameters: Sequence[Tensor],
+    splats: Mapping[str, Tensor],
     *,
     exact: bool = True,
     distortion: bool = True,
@@ -187,17 +168,17 @@ def forward(
 ) -> ForwardState:
     """Render one view.
 
-    The parameters are contiguous float32 tensors in the order of ``Splats``, on the launcher's device. Without
+    The six parameters are contiguous float32 tensors on the launcher's device. Without
     ``distortion`` that image is NaN, which saves a tenth of the blending. Without ``transmittance`` the depth by
     transmittance is empty. ``exact=False`` disables culling inside tiles and of splats without an ellipse (tests).
     ``whole_lists`` cuts no list into pieces, as further channels need it.
     """
-    device = parameters[0].device
+    device = splats["means"].device
 
     def floats(*shape: int) -> Tensor:
         return torch.empty(shape, dtype=torch.float32, device=device)
 
-    projected = _project(launcher, view, parameters, errors=False, exact=exact)
+    projected = _project(launcher, view, splats, errors=False, exact=exact)
     found = _bin(launcher, view, projected, exact, budget, whole_lists=whole_lists)
     words = (len(found["entries"]) >> 5) + len(found["tiles"]) + 1
     found |= {"records": projected["records"], "seen": torch.empty(words, 8, dtype=torch.int32, device=device)}
@@ -280,54 +261,48 @@ def _bin(
     return lists | {"order": order, "ends": ends, "permutation": permutation}
 
 
-@dataclass(frozen=True, eq=False)
-class RequestedGradients:
-    """The gradients that a backward pass computes.
+def backward(
+    launcher: Launcher,
+    frame: ForwardState,
+    splats: Mapping[str, Tensor],
+    upstream: Mapping[str, Tensor | None],
+    wanted: Mapping[str, Tensor | None],
+    *,
+    learns: Tensor | None = None,
+    deterministic: bool = False,
+    features: Sequence[Tensor] | None = None,
+) -> None:
+    """Compute gradients.
 
-    Attributes
+    Parameters
     ----------
-    parameters : dict of Tensor or None
-        Output tensors by name of the parameter, ``probe`` and ``intrinsics`` [N, 4]; None is not computed.
+    launcher, frame, splats
+        Of the forward pass.
+    upstream : mapping of str to Tensor or None
+        Gradients of the images by name.
+    wanted : mapping of str to Tensor or None
+        Output tensors by name of the parameter, "probe" and "intrinsics" [N, 4]; None is not computed.
     learns : Tensor [N] bool, optional
         Splats with gradients; all others get zeros.
     deterministic : bool
         Sum without atomics: 320 bytes for each pair of splat and tile, and one more pass.
+    features : sequence of Tensor, optional
+        The values [N, F], background [F] and images [F, H, W] of further channels, the gradients of these images, and
+        zeros [N, F] for the gradients of the values. They exclude ``learns`` and a gradient of the depth by
+        transmittance.
     """
-
-    parameters: dict[str, Tensor | None]
-    learns: Tensor | None = None
-    deterministic: bool = False
-
-    @property
-    def only_colors(self) -> bool:
-        """Whether only colours have gradients."""
-        return all(tensor is None for name, tensor in self.parameters.items() if name not in ("sh0", "shN"))
-
-
-def backward(
-    launcher: Launcher,
-    frame: ForwardState,
-    parameters: Sequence[Tensor],
-    upstream: dict[str, Tensor | None],
-    wanted: RequestedGradients,
-    features: Sequence[Tensor] | None = None,
-) -> None:
-    """Compute the gradients in ``wanted``.
-
-    ``features`` are the values [N, F], background [F] and images [F, H, W] of further channels, the gradients of these
-    images, and zeros [N, F] for the gradients of the values. They exclude ``wanted.learns`` and a gradient of the depth
-    by transmittance.
-    """
-    if len(parameters[0]) == 0:
+    if len(splats["means"]) == 0:
         return
-    only_colors = wanted.only_colors and features is None
+    only_colors = features is None and all(
+        tensor is None for name, tensor in wanted.items() if name not in ("sh0", "shN")
+    )
     if only_colors and upstream["color"] is None:
-        for tensor in wanted.parameters.values():
+        for tensor in wanted.values():
             if tensor is not None:
                 tensor.zero_()
         return
-    probe = wanted.parameters["probe"]
-    sums = _Sums(frame, wanted.deterministic, columns=0 if only_colors else 16)
+    probe = wanted["probe"]
+    sums = _Sums(frame, deterministic, columns=0 if only_colors else 16)
     further = None
     if features is not None:
         values, background, blended_values, gradients_of_images, to_values = features
@@ -337,15 +312,15 @@ def backward(
         frame.lists,
         frame.images,
         upstream,
-        {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns},
+        {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": learns},
         piece_buffers(frame.pieces, len(frame.pieces)),
         absolute=probe is not None and probe.shape[1] == 4,
         features=further,
     )
     _run(launcher, frame.view, blended)
     gradients, extras = sums.of_splats(launcher)
-    given = {"tile_counts": frame.tile_counts, "learns": wanted.learns, "gradients": gradients, "extras": extras}
-    _run(launcher, frame.view, splat_gradients(_named(parameters), given, wanted.parameters))
+    given = {"tile_counts": frame.tile_counts, "learns": learns, "gradients": gradients, "extras": extras}
+    _run(launcher, frame.view, splat_gradients(splats, given, wanted))
 
 
 class _Sums:
@@ -394,14 +369,14 @@ class _Sums:
 def errors(
     launcher: Launcher,
     view: ctypes.Structure,
-    parameters: Sequence[Tensor],
+    splats: Mapping[str, Tensor],
     image: Tensor,
     mask: Tensor | None,
     occlusion: bool = False,
 ) -> Tensor:
     """Return the splat errors [N] of one view; image float32 [H, W, 3] and mask bool [H, W] are contiguous."""
-    count = parameters[0].shape[0]
-    projected = _project(launcher, view, parameters, errors=True)
+    count = len(splats["means"])
+    projected = _project(launcher, view, splats, errors=True)
     if count == 0:
         return torch.empty(0, dtype=torch.float32, device=image.device)
     given: dict[str, Tensor | None] = {"image": image, "mask": mask}

@@ -48,8 +48,6 @@ from gs2d.render.cuda_works import (
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.whole_step import WholeStep
 
-__all__ = ["Arena", "Stepper"]
-
 SPARE = 1.2  # allocated memory relative to the need, so that a few more splats or pairs fit
 DEPTH_BITS = 32
 TICKETS = 16  # counters; each pass of both sorts and the running sums take one

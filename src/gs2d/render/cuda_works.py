@@ -15,20 +15,6 @@ from torch import Tensor
 from gs2d.kernels.cuda.kernel_arguments import THREADS, cuda_structure, work_of
 from gs2d.kernels.cuda.launch import Work
 
-__all__ = [
-    "THREADS",
-    "blend",
-    "blend_gradients",
-    "blocks_of",
-    "order_tiles",
-    "piece_buffers",
-    "piece_words",
-    "project",
-    "see",
-    "splat_gradients",
-    "takes_view",
-]
-
 ORDER_THREADS = 512  # order.cu
 MOST_PIECES = 1024  # about the number of blocks that a large GPU runs at once
 SHORTEST_PIECE = 128  # entries: 4 chunks, whose blending takes several times as long as adding up the pieces

@@ -9,6 +9,7 @@ photograph and rendering, after the camera: the transform changes the object's c
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any
 
 import torch
@@ -16,8 +17,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.core.checks import check_shapes
-from gs2d.kernels.library import library_for
-from gs2d.render import native_image_ops as native
+from gs2d.kernels.c_structures import arguments_of
+from gs2d.kernels.library import Library, library_for
 
 RIDGE = 1e-4  # per pixel: keeps what the pixels do not determine at the identity
 
@@ -58,30 +59,51 @@ def expose(
         assert background is not None
         arrays |= {"coverage": (coverage, "H W"), "background": (background, "3")}
     check_shapes(arrays)
-    exposed: Tensor = _Expose.apply(color, transform, coverage, background)
+    coverage = None if coverage is None else coverage.detach()
+    library = library_for(color)
+    if library is None:
+        return _exposed(color, transform, coverage, background)
+    exposed: Tensor = _Expose.apply(library, color, transform, coverage, background)
     return exposed
 
 
 class _Expose(torch.autograd.Function):
+    """The transform in native code (``kernels/cpu/exposure.cpp``)."""
+
     @staticmethod
     def forward(
         ctx: Any,
+        library: Library,
         color: Tensor,
         transform: Tensor,
         coverage: Tensor | None,
         background: Tensor | None,
     ) -> Tensor:
-        ctx.library = library_for(color)
-        arguments = (color, transform, coverage, background)
-        ctx.save_for_backward(*arguments)
-        return _exposed(*arguments) if ctx.library is None else native.expose(ctx.library, *arguments)
+        color, coverage = library.arrays(color=color, coverage=coverage)
+        out = torch.empty_like(color)
+        library.call("gs2d_expose", _picture(color, transform, coverage, background), None, out, None)
+        ctx.library = library
+        ctx.save_for_backward(color, transform, coverage, background)
+        return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        arguments = (upstream, *ctx.saved_tensors)
-        gradients = _gradients(*arguments) if ctx.library is None else native.expose_vjp(ctx.library, *arguments)
-        return (*gradients, None, None)
+        color, transform, coverage, background = ctx.saved_tensors
+        upstream, to_color, sums = upstream.contiguous(), torch.empty_like(color), torch.empty(12, dtype=torch.float64)
+        picture = _picture(color, transform, coverage, background)
+        if ctx.library.call("gs2d_expose_vjp", picture, None, upstream, to_color, sums) != 0:
+            raise MemoryError("gs2d_expose_vjp could not allocate its sums")
+        return None, to_color, sums.reshape(3, 4).to(transform.dtype), None, None
+
+
+def _picture(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> ctypes.Structure:
+    """Return the arguments of the native functions; the tensors are contiguous."""
+    picture = arguments_of("gs2d_expose", color=color, coverage=coverage, pixels=color.numel() // 3)
+    picture.transform = tuple(transform.flatten().tolist())
+    if coverage is not None and background is not None:
+        picture.background = tuple(background.tolist())
+    return picture
 
 
 def _exposed(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> Tensor:
@@ -90,21 +112,6 @@ def _exposed(color: Tensor, transform: Tensor, coverage: Tensor | None, backgrou
         return _apply(color, transform[:, :3]) + transform[:, 3]
     behind = (1 - coverage[..., None]) * background.to(color.dtype)
     return _apply(color - behind, transform[:, :3]) + coverage[..., None] * transform[:, 3] + behind
-
-
-def _gradients(
-    upstream: Tensor,
-    color: Tensor,
-    transform: Tensor,
-    coverage: Tensor | None,
-    background: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Return the gradients of ``color`` and ``transform``, computed by torch."""
-    light, weight = color, torch.ones_like(color[..., 0])
-    if coverage is not None and background is not None:
-        light, weight = color - (1 - coverage[..., None]) * background.to(color.dtype), coverage
-    sums = [(upstream[..., i] * right).sum() for i in range(3) for right in (*light.unbind(dim=-1), weight)]
-    return _apply(upstream, transform[:, :3].T), torch.stack(sums).reshape(3, 4)
 
 
 def _apply(vectors: Tensor, matrix: Tensor) -> Tensor:

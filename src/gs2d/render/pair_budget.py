@@ -9,8 +9,6 @@ from torch import Tensor
 
 from gs2d.kernels.cuda.driver import fault_of
 
-__all__ = ["MAX_PAIRS", "PairBudget", "Rendering", "room_for"]
-
 SLACK = 1.25  # room for a new view, relative to the largest count at its image size
 VIEW_SLACK = 1.1  # room for a known view, relative to its last count
 MAX_VIEWS = 1 << 14  # counts to keep; a learned camera is a new view each time

@@ -17,11 +17,9 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.core.sh import C0, num_coefficients, sh_basis
 from gs2d.core.splats import Splats
-from gs2d.kernels.library import library_for
-from gs2d.render import native_image_ops as native
+from gs2d.kernels.c_structures import arguments_of
+from gs2d.kernels.library import Library, library_for
 from gs2d.render.types import RenderOutput
-
-__all__ = ["attach_pose_grad", "normals_without_pose_grad", "pose_gradient", "with_world_normals"]
 
 
 def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
@@ -103,13 +101,19 @@ class _TurnNormals(torch.autograd.Function):
 def _wrench(
     pose: Tensor, means: Tensor, quats: Tensor, shN: Tensor, degree: int, gradients: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Return the wrench (``native_image_ops.Wrench``) of the gradients of means, quats and, for ``degree`` > 0, sh0."""
+    """Return force and torque [3], float64, of the gradients of means, quats and, for ``degree`` > 0, sh0.
+
+    They are the derivatives by a translation and by a rotation of the scene about the camera centre, world axes.
+    """
     T = pose.detach().double().cpu()
     center = -T[:3, :3].T @ T[:3, 3]
     library = library_for(means)
     if library is not None:
-        colors = (shN, gradients[2], degree) if degree > 0 else None
-        return native.wrench(library, center, means, gradients[0], (quats, gradients[1]), colors)
+        given = {"points": means, "to_points": gradients[0], "quats": quats, "to_quats": gradients[1]}
+        if degree > 0:  # harmonics do not rotate with the scene
+            given |= {"shN": shN, "to_sh0": gradients[2]}
+        sizes = {"sh_rest": shN.shape[1], "degree": degree}
+        return _native_wrench(library, center, len(means), **given, **sizes)
     to_splats = means - center.to(means)  # [N, 3]
     force = gradients[0].sum(dim=0).double().cpu()
     products = _products(quats, gradients[1])  # [4, 4]
@@ -120,6 +124,20 @@ def _wrench(
         values = sh_basis(torch.nn.functional.normalize(to_splats, dim=1), degree)[:, 1:]
         torque = torque - torch.einsum("akj,kj->a", turns_of_harmonics(degree), _products(weights, values))
     return force, torque
+
+
+def _native_wrench(library: Library, center: Tensor, count: int, **tensors: Tensor | int) -> tuple[Tensor, Tensor]:
+    """Return force and torque, summed in native code, which skips rows that are not finite.
+
+    ``tensors`` are fields of ``struct Moved`` of ``kernels/cpu/camera.cpp``. Without ``quats`` the points are vectors
+    that rotate. The result does not depend on the number of threads.
+    """
+    given = {name: t.detach().contiguous() if isinstance(t, Tensor) else t for name, t in tensors.items()}
+    moved = arguments_of("gs2d_camera_wrench", count=count, center=tuple(center.tolist()), **given)
+    sums = torch.empty(2, 3, dtype=torch.float64)
+    if library.call("gs2d_camera_wrench", moved, sums) != 0:
+        raise MemoryError("gs2d_camera_wrench could not allocate its sums")
+    return sums[0], sums[1]
 
 
 @cache
@@ -165,7 +183,7 @@ def _turned(vectors: Tensor, gradients: Tensor) -> Tensor:
     """Return the derivative [3] by a rotation of vectors [N, 3], float64 on the CPU."""
     library = library_for(vectors)
     if library is not None:
-        return native.wrench(library, vectors.new_zeros(3), vectors, gradients)[1]
+        return _native_wrench(library, vectors.new_zeros(3), len(vectors), points=vectors, to_points=gradients)[1]
     return _axial(_products(vectors, gradients))
 
 

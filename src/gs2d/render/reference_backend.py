@@ -11,8 +11,6 @@ from gs2d.render import reference_errors, reference_rasterizer
 from gs2d.render.backends import Backend, register_backend
 from gs2d.render.types import Features, RasterSettings, RenderOutput
 
-__all__ = ["PLAIN", "ReferenceBackend"]
-
 
 @register_backend("reference")
 class ReferenceBackend(Backend):

@@ -11,8 +11,6 @@ from gs2d.render.reference_projection import blocks, cutoff_squared, project, sc
 from gs2d.render.reference_rasterizer import evaluate_pairs, pair_alpha
 from gs2d.render.types import RasterSettings
 
-__all__ = ["splat_errors"]
-
 
 @torch.no_grad()
 def splat_errors(

@@ -27,8 +27,6 @@ from gs2d.render.reference_projection import (
 from gs2d.render.reference_transmittance import depth_at_half
 from gs2d.render.types import Features, RasterSettings, RenderOutput
 
-__all__ = ["Pairs", "blend_weights", "evaluate_pairs", "rasterize"]
-
 CHANNELS = 11  # before features: color 3, normal 3, alpha, depth_mean, depth_median, distortion, depth_transmittance
 
 

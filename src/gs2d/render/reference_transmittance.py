@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["MIN_SLOPE", "depth_at_half", "fraction_before", "transmittance_at"]
-
 STEPS = 64  # of bisection: as exact as a double
 MIN_SLOPE = 0.05  # of alpha per half width; bounds the gradient of pixels between two surfaces
 

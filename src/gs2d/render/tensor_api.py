@@ -25,8 +25,6 @@ from gs2d.render.api import check_dense, rasterize, rasterize_features
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
-__all__ = ["CameraTensors", "Rasterization", "SplatTensors", "rasterize_2dgs"]
-
 COLORS = 3  # channels in ``sh0``
 MIN_SCALE = 1e-18  # world units; limit of the kernels: only the low-pass filter draws a smaller disc
 MIN_OPACITY, MAX_OPACITY = 1e-30, 1 - 2.0**-20  # limits with finite logits; splats below alpha_min are not drawn

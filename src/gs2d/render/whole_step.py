@@ -12,8 +12,6 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.render.types import RasterSettings
 
-__all__ = ["Learned", "StepLosses", "StepNormals", "WholeStep"]
-
 
 class Learned(NamedTuple):
     """State and learning rate of an attribute.

@@ -73,7 +73,7 @@ def test_rows_that_begin_in_the_middle_of_sixteen_bytes_have_the_same_gradients(
     """A view of another tensor's rows is contiguous, but may start at any address."""
     import numpy as np
 
-    from gs2d.render import cuda_rasterizer as cuda
+    from gs2d.render.cuda_backend import CudaBackend
     from gs2d.render.types import RasterSettings
     from render_scenes import contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
@@ -87,8 +87,7 @@ def test_rows_that_begin_in_the_middle_of_sixteen_bytes_have_the_same_gradients(
             room = torch.zeros(len(tensor) + 1, *tensor.shape[1:])
             room[shift : shift + len(tensor)] = tensor.detach()
             setattr(scene, name, room[shift : shift + len(tensor)].requires_grad_())
-        choices = cuda.CudaChoices(deterministic=True)
-        output = cuda.rasterize_with(emulator, scene, camera, RasterSettings(), choices=choices)
+        output = CudaBackend(launcher=emulator, deterministic=True).rasterize(scene, camera, RasterSettings())
         contraction(output, cotangents).backward()
         found.append([tensor.grad for _, tensor in scene.items()])
     assert scene.means.data_ptr() % 16 != 0

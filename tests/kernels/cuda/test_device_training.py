@@ -230,7 +230,7 @@ def test_unused_room_is_empty_and_too_little_room_sets_overflow(
     camera = front_camera(40, 200)
     scene = stack(splat((0.1, 0.0, 2.0), (0.8, 0.8)), splat((0.0, -25.0, 3.0), (0.8, 0.3)))
     view = cuda_passes.view_of(camera, RasterSettings(sh_degree=0))
-    parameters = [tensor for _, tensor in scene.items()]
+    parameters = dict(scene.items())
     budget = cuda_budget.PairBudget()
     exact = cuda_passes.forward(emulator, view, parameters, exact=False, budget=budget)
     assert budget.overflow is None

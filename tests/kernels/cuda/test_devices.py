@@ -26,7 +26,7 @@ ctypes.CDLL(sys.argv[1])
 sys.path.insert(0, sys.argv[2])
 
 from gs2d.kernels.cuda import cuda_adam as adam, kernel_arguments as arguments, launch, cuda_losses as ops
-from gs2d.render import cuda_rasterizer as cuda, pair_budget as cuda_budget, cuda_passes, cuda_works
+from gs2d.render import kernel_backend, pair_budget as cuda_budget, cuda_passes, cuda_works
 from fake_backends import altered
 from gs2d.render.cuda_backend import CudaBackend
 
@@ -117,17 +117,19 @@ camera = front_camera(40, 24)
 budget.room = lambda tiles: 1000
 with FakeTensorMode():
     def rand(*shape): return torch.rand(*shape, device="cuda:0")
-    splats = (rand(9, 3), rand(9, 4), rand(9, 2), rand(9), rand(9, 1, 3), rand(9, 15, 3))
+    tensors = (rand(9, 3), rand(9, 4), rand(9, 2), rand(9), rand(9, 1, 3), rand(9, 15, 3))
+    splats = dict(zip(("means", "quats", "log_scales", "opacity_logits", "sh0", "shN"), tensors))
     view = cuda_passes.view_of(camera, RasterSettings())
     rows = torch.ones(9, dtype=torch.bool, device="cuda:0")
     for sure, transmittance in ((False, False), (True, False), (False, True), (True, True)):
-        choices = cuda.CudaChoices(deterministic=sure, budget=budget)
-        options = cuda._CudaOptions(launcher, view, True, transmittance, choices, rows, None)
+        chosen = CudaBackend(budget, launcher=launcher, deterministic=sure)
+        settings = RasterSettings(with_transmittance_depth=transmittance)
+        options = kernel_backend._View(chosen, camera, settings, rows, None)
         for columns in (2, 4):
             intrinsics = torch.rand(4)  # in the host's memory, where cameras are
             needs = (False, True, True, False, *[True] * 6)
-            there_and_back(cuda._CudaRasterize, needs, options, rand(9, columns), intrinsics, None, *splats)
-        there_and_back(cuda._CudaRasterize, (*[False] * 8, True, True), options, None, None, None, *splats)
+            there_and_back(kernel_backend._Rasterize, needs, options, rand(9, columns), intrinsics, None, *tensors)
+        there_and_back(kernel_backend._Rasterize, (*[False] * 8, True, True), options, None, None, None, *tensors)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
     there_and_back(ops._CudaPhotometric, (True,), image, rand(24, 40, 3), mask, None, None, True, launcher)
     for form, weights in ((False, None), (True, plane)):

@@ -15,9 +15,9 @@ import torch
 from emulate import Emulator
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize
+from gs2d.render.cuda_backend import CudaBackend
 from kernel_cases import SETTINGS, double, gradients, many_tiles, render
 from render_scenes import IMAGES, front_camera, random_cotangents, splat, stack
 
@@ -78,6 +78,6 @@ def test_the_order_of_threads_warps_and_blocks_does_not_change_images(emulator: 
 def test_arguments_that_would_read_beyond_an_array_are_refused(emulator: Emulator) -> None:
     camera, scene = front_camera(), splat()
     with pytest.raises(ShapeError, match="sh_degree"):
-        cuda.rasterize_with(emulator, scene, camera, SETTINGS)  # degree 3, but only the first coefficient
+        CudaBackend(launcher=emulator).rasterize(scene, camera, SETTINGS)  # degree 3, but only the first coefficient
     with pytest.raises(ShapeError, match="float32"):
-        cuda.rasterize_with(emulator, double(scene), camera, replace(SETTINGS, sh_degree=0))
+        CudaBackend(launcher=emulator).rasterize(double(scene), camera, replace(SETTINGS, sh_degree=0))

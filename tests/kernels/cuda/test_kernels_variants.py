@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,9 @@ from emulate import Emulator
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.render import cuda_passes
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
+from gs2d.render.cuda_backend import CudaBackend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import PLAIN_COLORS, Features
 from kernel_cases import SETTINGS, Case, crossing_tiles, double, many_tiles
 from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
@@ -51,8 +51,7 @@ def gradients(
     probe = torch.zeros(len(scene), columns, requires_grad=True) if columns else None
     rows, distortion = options.pop("gradient_rows", None), options.pop("distortion", True)
     settings = replace(SETTINGS, sh_degree=3 if scene.shN.shape[1] else 0, with_distortion=distortion)
-    choices = cuda.CudaChoices(**options)
-    output = cuda.rasterize_with(launcher, scene, case.camera, settings, probe, rows, choices=choices)
+    output = CudaBackend(launcher=launcher, **options).rasterize(scene, case.camera, settings, probe, rows)
     contraction(output, dict(cotangents)).backward()
     found = {name: tensor.grad for name, tensor in scene.items() if name in trained}
     if probe is not None:
@@ -98,23 +97,20 @@ def test_deterministic_gradients_of_features_do_not_depend_on_order_or_culling(
     settings = replace(SETTINGS, sh_degree=PLAIN_COLORS)
     numbers = torch.randn(len(case.splats), 37, generator=torch.Generator().manual_seed(1))
 
-    def gradients_of(rasterize: Any, dtype: torch.dtype = torch.float32, **options: Any) -> dict[str, Tensor]:
+    def gradients_of(rasterize: Any, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
         scene = requiring_grad(case.splats.to(dtype=dtype))
         values = numbers.to(dtype, copy=True).requires_grad_()
         probe = torch.zeros(len(scene), 4, dtype=dtype, requires_grad=True)
         features = Features(values, numbers[0].to(dtype))
-        rasterize(scene, case.camera, settings, probe, features=features, **options).color.square().sum().backward()
+        rasterize(scene, case.camera, settings, features, probe).color.square().sum().backward()
         tensors = {**dict(scene.items()), "values": values, "probe": probe}
         return {name: tensor.grad for name, tensor in tensors.items() if tensor.grad is not None}
 
     first, second = (
-        gradients_of(
-            partial(cuda.rasterize_with, launcher),
-            choices=cuda.CudaChoices(deterministic=True, exact_masks=exact),
-        )
+        gradients_of(CudaBackend(launcher=launcher, deterministic=True, exact_masks=exact).rasterize_features)
         for launcher, exact in ((emulator, True), (replace(emulator, seed=1), False))
     )
-    expected = gradients_of(reference.rasterize, torch.float64)
+    expected = gradients_of(PLAIN.rasterize_features, torch.float64)
     assert {"values", "probe", "means", "sh0"} <= first.keys()
     for name, gradient in first.items():
         assert torch.equal(gradient, second[name]), name
@@ -183,7 +179,7 @@ def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, se
     """Splats that reach the camera plane: tiles that they cannot touch are not even candidates."""
     case = crossing_tiles(seed)
     view = cuda_passes.view_of(case.camera, SETTINGS)
-    parameters = [tensor.contiguous() for _, tensor in case.splats.items()]
+    parameters = {name: tensor.contiguous() for name, tensor in case.splats.items()}
     culled, full = (cuda_passes.forward(emulator, view, parameters, exact=exact) for exact in (True, False))
     for name in IMAGES:
         assert torch.equal(culled.images[name], full.images[name]), name
@@ -202,8 +198,8 @@ def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, se
 
 def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulator: Emulator) -> None:
     case = many_tiles()
-    full = cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS)
-    part = cuda.rasterize_with(emulator, case.splats, case.camera, replace(SETTINGS, with_distortion=False))
+    full = CudaBackend(launcher=emulator).rasterize(case.splats, case.camera, SETTINGS)
+    part = CudaBackend(launcher=emulator).rasterize(case.splats, case.camera, replace(SETTINGS, with_distortion=False))
     assert bool(part.distortion.isnan().all())  # reveals accidental use
     for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "radii"):
         assert torch.equal(getattr(full, name), getattr(part, name)), name
@@ -227,7 +223,7 @@ def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None
     x, y = (3192.0 - 1600.0) / 800, (3192.0 - 1600.0) / 800  # px at depth 2
     scene = stack(splat((x, y, 2.0), (2e-3, 1e-3), 0.7, (0.9, 0.2, 0.1)), splat((x, y - 1e-3, 2.01), (2e-3, 2e-3), 0.8))
     settings = replace(SETTINGS, sh_degree=0)
-    parameters = [t for _, t in scene.items()]
+    parameters = dict(scene.items())
     g_color = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
     found: list[tuple[Tensor, Tensor]] = []
     for cam in (camera, near):
@@ -236,7 +232,7 @@ def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None
         upstream["color"] = torch.zeros(cam.height, cam.width, 3)
         upstream["color"][-16:, -16:] = g_color
         means = torch.empty_like(scene.means)
-        wanted = cuda_passes.RequestedGradients({**dict.fromkeys(ATTRIBUTES), "means": means, "probe": None})
+        wanted = {**dict.fromkeys((*ATTRIBUTES, "probe")), "means": means}
         cuda_passes.backward(FewBlocks(emulator), frame, parameters, upstream, wanted)
         found.append((frame.images["color"][-16:, -16:], means))
     (far_color, far_means), (near_color, near_means) = found

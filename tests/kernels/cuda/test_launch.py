@@ -19,7 +19,6 @@ from emulate import Emulator
 from fake_driver import FakeDriver, Result
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
@@ -93,7 +92,7 @@ def test_a_scene_through_launcher_and_driver_equals_the_kernels_result(emulator:
     results = []
     for runner in (emulator, fake_driver.launcher(FakeDriver(emulator=emulator))):
         scene = requiring_grad(splats)
-        output = cuda.rasterize_with(runner, scene, camera, RasterSettings())
+        output = CudaBackend(launcher=runner).rasterize(scene, camera, RasterSettings())
         contraction(output, cotangents).backward()
         results.append([getattr(output, name).detach() for name in IMAGES] + [t.grad for _, t in scene.items()])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))

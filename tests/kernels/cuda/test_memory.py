@@ -14,7 +14,7 @@ import train_toys
 from emulate import Emulator
 from fake_backends import cuda_on_host
 from gs2d.kernels.cuda import launch
-from gs2d.render import cuda_rasterizer as cuda
+from gs2d.render.cuda_backend import CudaBackend
 from kernel_cases import SETTINGS, many_tiles
 from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
 
@@ -53,11 +53,11 @@ def test_no_pass_of_the_rasterizer_reads_uninitialised_memory(emulator: Emulator
     def work() -> list[Tensor]:
         scene = requiring_grad(case.splats)
         probe = torch.zeros(len(scene), 4, requires_grad=True)
-        choices = cuda.CudaChoices(deterministic=deterministic)
-        output = cuda.rasterize_with(emulator, scene, case.camera, SETTINGS, probe, choices=choices)
+        backend = CudaBackend(launcher=emulator, deterministic=deterministic)
+        output = backend.rasterize(scene, case.camera, SETTINGS, probe)
         contraction(output, cotangents).backward()
-        given = (emulator, case.splats, case.camera, image, SETTINGS)
-        errors = [cuda.splat_errors_with(*given, occlusion=occlusion) for occlusion in (False, True)]
+        given = (case.splats, case.camera, image, SETTINGS)
+        errors = [backend.splat_errors(*given, occlusion=occlusion) for occlusion in (False, True)]
         grads = [tensor.grad for _, tensor in scene.items()] + [probe.grad]
         images = [getattr(output, name).detach() for name in IMAGES]
         return [*images, *(grad for grad in grads if grad is not None), *errors]

@@ -17,8 +17,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels.cuda.kernel_arguments import work_of
 from gs2d.render import cuda_passes, cuda_works
-from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
+from gs2d.render.cuda_backend import CudaBackend
 from kernel_cases import SETTINGS, double, many_tiles
 from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 
@@ -49,8 +49,8 @@ def rendered(launcher: Any, scene: tuple[Splats, Camera], **options: Any) -> dic
     """Return images, and gradients of all parameters and of the densification signal."""
     splats, camera = requiring_grad(scene[0]), scene[1]
     probe = torch.zeros(len(splats), 4, requires_grad=True)
-    choices = cuda.CudaChoices(deterministic=True, **options)
-    output = cuda.rasterize_with(launcher, splats, camera, EVERYTHING, probe, choices=choices)
+    backend = CudaBackend(launcher=launcher, deterministic=True, **options)
+    output = backend.rasterize(splats, camera, EVERYTHING, probe)
     cotangents = random_cotangents(np.random.default_rng(1), camera)
     (contraction(output, cotangents) + output.depth_transmittance.mean()).backward()
     grads = {f"gradient of {name}": tensor.grad for name, tensor in splats.items()} | {"probe": probe.grad}
@@ -60,7 +60,9 @@ def rendered(launcher: Any, scene: tuple[Splats, Camera], **options: Any) -> dic
 
 def frame_of(launcher: Any, scene: tuple[Splats, Camera], **options: Any) -> cuda_passes.ForwardState:
     view = cuda_passes.view_of(scene[1], EVERYTHING)
-    return cuda_passes.forward(launcher, view, [tensor.contiguous() for _, tensor in scene[0].items()], **options)
+    return cuda_passes.forward(
+        launcher, view, {name: tensor.contiguous() for name, tensor in scene[0].items()}, **options
+    )
 
 
 def pieces_of(memory: Tensor) -> list[int]:
@@ -137,8 +139,8 @@ def test_colour_gradients_alone_agree(
     def of_colors() -> dict[str, Tensor]:
         splats = Splats(**{name: t.clone().requires_grad_(name == "sh0") for name, t in deep[0].items()})
         rows = torch.arange(len(splats)) % 3 == 0
-        choices = cuda.CudaChoices(deterministic=True)
-        output = cuda.rasterize_with(emulator, splats, deep[1], EVERYTHING, gradient_rows=rows, choices=choices)
+        backend = CudaBackend(launcher=emulator, deterministic=True)
+        output = backend.rasterize(splats, deep[1], EVERYTHING, gradient_rows=rows)
         output.color.square().sum().backward()
         assert splats.sh0.grad is not None
         return {"sh0": splats.sh0.grad}

@@ -384,6 +384,3 @@ def _check_all_done(tasks: Sequence[Task]) -> None:
         name, reason = next(iter(own.items()))
         more = f" (and {len(own) - 1} more, in {tasks[0].record.parent})" if len(own) > 1 else ""
         raise RunError(f"{name} failed: {reason}{more}; finished tasks are kept; fix that and run the command again")
-
-
-__all__ = ["BLOCKS_JSON", "blocks", "tasks_of"]

@@ -1,4 +1,4 @@
-// The rasterizer's exported functions. render/native_rasterizer.py calls them and checks sizes and types.
+// The rasterizer's exported functions. render/cpu_backend.py calls them and checks sizes and types.
 #include <pthread.h>
 
 #include "cpu/export.h"

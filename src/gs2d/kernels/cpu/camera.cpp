@@ -14,7 +14,7 @@ namespace {
 constexpr int64_t PIECE = 1024;  // rows
 constexpr int SUMS = 6;          // force, torque
 
-// Layout mirrored in render/native_image_ops.py.
+// Filled in render/pose_gradient.py.
 struct Moved {
     int64_t count;
     const real *points, *to_points;  // [N, 3] and their gradients

@@ -14,7 +14,7 @@ namespace {
 constexpr int64_t PIECE = 2048;  // pixels
 constexpr int SUMS = 12;
 
-// Layout mirrored in render/native_image_ops.py.
+// Filled in render/exposure_transform.py.
 struct Picture {
     const real* color;     // [pixels, 3]
     const real* coverage;  // [pixels], or null: 1

@@ -45,7 +45,7 @@ template <class T> struct Buffer {
     T& operator[](size_t i) const { return data[i]; }
 };
 
-// Packed field by field in render/native_rasterizer.py; change both.
+// Packed field by field in render/cpu_passes.py; change both.
 struct View {
     double R[9], t[3], center[3];  // x_cam = R x + t; camera centre in the world
     double fx, fy, cx, cy;

@@ -22,21 +22,6 @@ from gs2d.core.atomic_files import atomic_write
 from gs2d.errors import BackendError, DiskError
 from gs2d.kernels.cuda.driver import one_line
 
-__all__ = [
-    "ARCHITECTURES",
-    "Cubin",
-    "architecture_for",
-    "cache_folder",
-    "compile_source",
-    "compile_text",
-    "cubin",
-    "is_writable",
-    "kernel_sources",
-    "nvrtc_version",
-    "source_names",
-    "sources",
-]
-
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
 # GPUs integrated with a CPU (Xavier, Orin, Thor): their code and that of other GPUs of the same major version are not
 # compatible.

@@ -18,8 +18,6 @@ from gs2d.kernels.native_adam import AdamUpdate, bias_corrections, check_update
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher, Work
 
-__all__ = ["AdamUpdate", "adam_step", "adam_work"]
-
 BLOCK_ELEMENTS = 512  # adam.cu
 
 

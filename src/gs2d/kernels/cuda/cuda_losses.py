@@ -21,8 +21,6 @@ from gs2d.kernels.loss_operations import LossOperations, NormalOptions
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
 
-__all__ = ["CudaLosses", "ready", "strips"]
-
 STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows per block
 MEAN_PIXELS = 1024  # losses.cu: pixels per block
 NORMAL_W, NORMAL_H = 32, 8  # losses.cu: tile of the backward pass

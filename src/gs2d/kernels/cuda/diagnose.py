@@ -11,8 +11,6 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda.driver import OLD_DRIVER, PER_THREAD, driver_version, load_driver, own_default_stream
 
-__all__ = ["machine"]
-
 ANYWAY = "or use --backend cpu"
 OLDEST_CUDA = (12, 0)  # first version that loads kernels for all devices at once
 

@@ -9,8 +9,6 @@ from typing import Any
 
 from gs2d.errors import BackendError
 
-__all__ = ["call", "driver_version", "fault_of", "load_driver", "own_default_stream"]
-
 BINDINGS_REMEDY = "pip install cuda-bindings (torch's CUDA wheels for Linux bring it), or use --backend cpu"
 DRIVER_REMEDY = "install NVIDIA's driver (`nvidia-smi` must list the GPU), or use --backend cpu"
 OLD_DRIVER = "update NVIDIA's driver, or install the torch build and NVRTC of the driver's CUDA version"

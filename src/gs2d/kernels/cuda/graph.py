@@ -11,8 +11,6 @@ from typing import Any
 
 from gs2d.kernels.cuda.driver import call, failure
 
-__all__ = ["Graph", "Work"]
-
 
 class Work:
     """A launch that is repeated with the same argument structure.

@@ -11,8 +11,6 @@ from typing import Any
 from gs2d.kernels.c_structures import fill, source_of, structure
 from gs2d.kernels.cuda.graph import Work
 
-__all__ = ["THREADS", "arguments_of", "cuda_structure", "fill", "work_of"]
-
 THREADS = 128  # per block of most kernels
 KERNEL = re.compile(r"__global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)")  # its name and its structure
 

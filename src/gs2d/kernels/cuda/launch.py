@@ -22,8 +22,6 @@ from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda.driver import PER_THREAD, call, failure, load_driver, own_default_stream
 from gs2d.kernels.cuda.graph import Graph, Work
 
-__all__ = ["GpuLauncher", "Launcher", "Work", "grow_in_place", "launcher_for", "steps"]
-
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
 STEP_VARIABLE, GRAPH, LAUNCHES = "GS2D_CUDA_STEP", "graph", "launches"
 GRAPHS_FROM = 3  # repetitions from which a graph pays off
@@ -114,19 +112,9 @@ class GpuLauncher:
             If there are too many blocks, the kernel does not compile or load, or the driver refuses the launch, also
             because an earlier kernel failed.
         """
-        if blocks == 0:
-            return
-        if blocks > MAX_BLOCKS:
-            raise BackendError(f"{name} needs {blocks} blocks, expected at most 2^31 - 1; use fewer splats or pixels")
-        driver = self._driver
-        given = (name, blocks, threads, ctypes.c_void_p(ctypes.addressof(arguments)))
-        if int(call(driver, "cuCtxGetCurrent")) == self._context_number:  # nearly always
-            status = self._start(*given)
-        else:
+        if blocks > 0:
             with self._in_context():
-                status = self._start(*given)
-        if status != driver.CUresult.CUDA_SUCCESS:
-            raise failure(f"the launch of {name} ({blocks} blocks of {threads})", status)
+                self._start([Work(name, blocks, threads, arguments)])
 
     def run(self, works: Sequence[Work]) -> None:
         """Start kernels in order on the current stream without waiting.
@@ -134,28 +122,28 @@ class GpuLauncher:
         From the third repetition on they run as a graph, if it can be made, which cuts the host's cost and the gaps
         between kernels. Raises BackendError like :meth:`launch`.
         """
-        if int(call(self._driver, "cuCtxGetCurrent")) == self._context_number:
-            self._run(works)
-        else:
-            with self._in_context():
-                self._run(works)
-
-    def _run(self, works: Sequence[Work]) -> None:
-        driver, stream = self._driver, self._stream(self._stream_of(self.device))
-        success = driver.CUresult.CUDA_SUCCESS
-        graph = self._graph_of(works) if self._replays and steps() == GRAPH else None
-        if graph is not None:
-            status = graph.launch(stream)
-            if status != success:
+        with self._in_context():
+            graph = self._graph_of(works) if self._replays and steps() == GRAPH else None
+            if graph is None:
+                self._start(works)
+                return
+            status = graph.launch(self._stream(self._stream_of(self.device)))
+            if status != self._driver.CUresult.CUDA_SUCCESS:
                 raise failure(f"the launch of {len(works)} kernels from {works[0].name} on", status)
-            return
+
+    def _start(self, works: Sequence[Work]) -> None:
+        """Launch in the current context; the driver copies the arguments."""
+        driver, stream = self._driver, self._stream(self._stream_of(self.device))
         for work in works:
-            function = self._functions.get(work.name) or self._load(work.name)
-            status = driver.cuLaunchKernel(
-                function, work.blocks, 1, 1, work.threads, 1, 1, 0, stream, work.parameters, 0
-            )[0]
-            if status != success:
-                raise failure(f"the launch of {work.name} ({work.blocks} blocks of {work.threads})", status)
+            name, blocks, threads = work.name, work.blocks, work.threads
+            if blocks > MAX_BLOCKS:
+                raise BackendError(
+                    f"{name} needs {blocks} blocks, expected at most 2^31 - 1; use fewer splats or pixels"
+                )
+            function = self._functions.get(name) or self._load(name)
+            status = driver.cuLaunchKernel(function, blocks, 1, 1, threads, 1, 1, 0, stream, work.parameters, 0)[0]
+            if status != driver.CUresult.CUDA_SUCCESS:
+                raise failure(f"the launch of {name} ({blocks} blocks of {threads})", status)
 
     def _graph_of(self, works: Sequence[Work]) -> Graph | None:
         """Return the updated graph of these launches; None if they were not repeated enough or graphs fail."""
@@ -177,12 +165,6 @@ class GpuLauncher:
             self._graphs.clear()
             return None
         return known
-
-    def _start(self, name: str, blocks: int, threads: int, argument: ctypes.c_void_p) -> Any:
-        """Launch in the current context; the driver copies the arguments."""
-        function = self._functions.get(name) or self._load(name)
-        stream, at = self._stream(self._stream_of(self.device)), ctypes.addressof(argument)
-        return self._driver.cuLaunchKernel(function, blocks, 1, 1, threads, 1, 1, 0, stream, at, 0)[0]
 
     @contextmanager
     def _in_context(self) -> Iterator[None]:

@@ -2,18 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "DIGITS",
-    "MOST_PASSES",
-    "MOST_SORTED",
-    "PIECE",
-    "SORT_THREADS",
-    "clear_blocks",
-    "digit_blocks",
-    "passes_of",
-    "pieces_of",
-]
-
 SORT_THREADS, PIECE, DIGITS, MOST_PASSES = 256, 2048, 256, 4  # sort.cu has the same
 MOST_SORTED = 1 << 29  # counts are stored in 30 bits
 MOST_BLOCKS = 2048  # of grid-stride kernels: more than any GPU runs at once
