@@ -16,7 +16,7 @@ from benchmarks.stages import Passes, count_work, frame_bytes, trim
 from benchmarks.workload import Workload, room_workload
 
 from gs2d.kernels.library import available_variants, load
-from gs2d.render.reference_rasterizer import rasterize as rasterize_reference
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings
 
 needs_native = pytest.mark.skipif(not available_variants(), reason="the native library was not built")
@@ -158,6 +158,6 @@ def test_the_count_of_pairs_agrees_with_a_count_through_the_reference() -> None:
     passes = Passes(library, Workload("few", splats, workload.cameras), 0)
     work = count_work(library, passes.forward(), 12)
     settings = RasterSettings(sh_degree=0)
-    alone = [rasterize_reference(splats.rows(torch.arange(12) == i), workload.cameras[0], settings) for i in range(12)]
+    alone = [PLAIN.rasterize(splats.rows(torch.arange(12) == i), workload.cameras[0], settings) for i in range(12)]
     assert float(passes.forward().alpha.detach().max()) < 0.9999
     assert work.pairs == sum(int((image.alpha > 0).sum()) for image in alone)

@@ -14,9 +14,8 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError
 from gs2d.kernels.library import Library, available_variants, load
-from gs2d.render import reference_errors
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.cpu_backend import CpuBackend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 
@@ -66,7 +65,7 @@ def test_the_float64_build_equals_the_reference_to_rounding(native64: Library, s
     splats, camera = awkward_scene(seed, 60)
     leaves = requiring_grad(splats)
     zeros = torch.zeros(len(splats), 4, dtype=torch.float64, requires_grad=True)
-    expected = reference.rasterize(leaves, camera, SETTINGS, zeros)
+    expected = PLAIN.rasterize(leaves, camera, SETTINGS, zeros)
     given = cotangents(camera, torch.float64, seed)
     torch.autograd.backward([getattr(expected, name) for name in IMAGES], [given[name] for name in IMAGES])
     found = everything(native64, splats, camera, seed=seed)
@@ -80,7 +79,7 @@ def test_the_float64_build_equals_the_reference_to_rounding(native64: Library, s
         )
     image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(9)).double()
     for occlusion in (False, True):
-        errors = reference_errors.splat_errors(splats, camera, image, SETTINGS, None, occlusion)
+        errors = PLAIN.splat_errors(splats, camera, image, SETTINGS, None, occlusion)
         torch.testing.assert_close(found[f"errors_{occlusion}"], errors, rtol=1e-9, atol=1e-9)
 
 

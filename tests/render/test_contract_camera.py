@@ -24,9 +24,9 @@ from gs2d.errors import ShapeError
 from gs2d.losses.base import LossView, compute_losses
 from gs2d.losses.formulas import normal_consistency
 from gs2d.render import pose_gradient as camera_gradient
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend, get_backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings, RenderOutput
 from render_scenes import (
     IMAGES,
@@ -79,7 +79,7 @@ def along_motions(gradient: Tensor | None, camera: Camera) -> Tensor:
 def straight(splats: Splats, camera: Camera, settings: RasterSettings, cotangents: dict[str, Tensor]) -> Tensor:
     """Return the gradient of the six motions [6] by autograd."""
     lens, pose = live(camera)
-    contraction(reference.rasterize(splats, lens, settings), cotangents).backward()
+    contraction(PLAIN.rasterize(splats, lens, settings), cotangents).backward()
     return along_motions(pose.grad, camera)
 
 
@@ -233,7 +233,7 @@ def test_20_normal_consistency_lets_both_normals_rotate_with_the_camera(kind: st
     splats = random_splats(rng, camera, 12, SMOOTH)
     mask = torch.tensor(rng.random((camera.height, camera.width)) < 0.8) if masked else None
     lens, expected = live(camera)
-    output = reference.rasterize(splats, lens, RasterSettings())
+    output = PLAIN.rasterize(splats, lens, RasterSettings())
     images = output.normal, output.depth_mean, output.alpha
     normal_consistency(*images, lens, mask, per_splat=kind == "normal_consistency_per_splat").backward()
 

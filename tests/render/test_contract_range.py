@@ -13,10 +13,9 @@ import torch
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.render import reference_errors
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import MAX_COLOR, MAX_SIZE, MIN_QUATERNION, RasterSettings
 from render_scenes import IMAGES, Y_AXIS, equal, front_camera, requiring_grad, splat, stack
 
@@ -39,7 +38,7 @@ def edge_camera(change: str) -> Camera:
 def assert_like_reference(backend: Backend, splats: Splats, camera: Camera, label: object) -> None:
     double = splats.to(dtype=torch.float64)
     low = rasterize(splats, camera, SETTINGS, backend=backend)
-    high = reference.rasterize(double, camera, SETTINGS)
+    high = PLAIN.rasterize(double, camera, SETTINGS)
     for name in IMAGES:
         a, b = getattr(low, name).double(), getattr(high, name)
         size = b.abs().clamp(min=1) if name in ("color", "depth_mean", "depth_median") else torch.ones_like(b)
@@ -47,7 +46,7 @@ def assert_like_reference(backend: Backend, splats: Splats, camera: Camera, labe
     assert bool(((low.radii.double() - high.radii).abs() <= 1e-2 * (1 + high.radii)).all()), ("radii", label)
     image = torch.zeros(camera.height, camera.width, 3)
     errors = splat_errors(splats, camera, image, SETTINGS, backend=backend).double()
-    expected = reference_errors.splat_errors(double, camera, image.double(), SETTINGS)
+    expected = PLAIN.splat_errors(double, camera, image.double(), SETTINGS)
     assert bool(((errors - expected).abs() <= 2e-3 * (1 + expected)).all()), ("errors", label, errors, expected)
 
 

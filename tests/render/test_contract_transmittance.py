@@ -19,10 +19,10 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import load
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.cpu_backend import CpuBackend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.tensor_api import CameraTensors, SplatTensors, rasterize_2dgs
 from gs2d.render.types import RasterSettings
 from render_scenes import (
@@ -148,7 +148,7 @@ def test_22_gradients_are_those_of_finite_differences() -> None:
         cotangent = torch.tensor(rng.normal(size=(8, 8)))
 
         def loss(splats: Splats, camera: Camera = camera, cotangent: Tensor = cotangent) -> Tensor:
-            depth = reference.rasterize(splats, camera, SETTINGS).depth("transmittance")
+            depth = PLAIN.rasterize(splats, camera, SETTINGS).depth("transmittance")
             return (cotangent * depth).sum() + (depth * depth).sum()
 
         leaves = requiring_grad(scene)
@@ -184,7 +184,7 @@ def test_22_values_and_gradients_agree_with_the_reference(backend: Backend) -> N
             splats = splats.to(dtype=torch.float32)
         low, high = requiring_grad(splats), requiring_grad(splats.to(dtype=torch.float64))
         a = rasterize(low, camera, SETTINGS, backend=backend)
-        b = reference.rasterize(high, camera, SETTINGS)
+        b = PLAIN.rasterize(high, camera, SETTINGS)
         depth = b.depth("transmittance")
         error = (a.depth("transmittance").double() - depth).abs() / depth.clamp(min=0.1)
         errors.append(error.detach().flatten())
@@ -207,7 +207,7 @@ def test_22_the_double_kernels_agree_with_the_reference_to_the_last_digits() -> 
         pytest.skip(str(error))
     for seed, splats, camera in random_cases(6):
         low, high = (requiring_grad(splats.to(dtype=torch.float64)) for _ in range(2))
-        a, b = CpuBackend(library).rasterize(low, camera, SETTINGS), reference.rasterize(high, camera, SETTINGS)
+        a, b = CpuBackend(library).rasterize(low, camera, SETTINGS), PLAIN.rasterize(high, camera, SETTINGS)
         depth = b.depth("transmittance")
         torch.testing.assert_close(a.depth("transmittance"), depth, rtol=1e-11, atol=1e-12)
         everywhere = torch.ones_like(depth, dtype=torch.bool)

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from gs2d.core.splats import ATTRIBUTES
-from gs2d.render import reference_errors
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from kernel_cases import SETTINGS, Case, cases, cases_with_margins, double, gradients, quantile
 from render_scenes import IMAGES, random_camera, random_cotangents, random_splats
 
@@ -44,7 +43,7 @@ def test_images_and_radii_agree_on_random_scenes(native: Backend, part: int) -> 
     radii = []
     for case in cases(120 // part):
         low = native.rasterize(case.splats, case.camera, SETTINGS)
-        high = reference.rasterize(double(case.splats), case.camera, SETTINGS)
+        high = PLAIN.rasterize(double(case.splats), case.camera, SETTINGS)
         for name in IMAGES:
             a, b = getattr(low, name).double(), getattr(high, name)
             assert a.shape == b.shape
@@ -70,7 +69,7 @@ def test_a_larger_image_with_many_tiles_and_layers_agrees(native: Backend) -> No
     splats = random_splats(rng, camera, 1500)
     splats = replace(splats, log_scales=splats.log_scales - 1).to(dtype=torch.float32)
     low = native.rasterize(splats, camera, SETTINGS)
-    high = reference.rasterize(double(splats), camera, SETTINGS)
+    high = PLAIN.rasterize(double(splats), camera, SETTINGS)
     assert float(high.alpha.mean()) > 0.8
     for name in ("color", "alpha", "normal"):
         difference = (getattr(low, name).double() - getattr(high, name)).abs()
@@ -98,8 +97,8 @@ def test_every_setting_is_used_alike(native: Backend, part: int, change: dict[st
     moved = 0.0
     for case in cases(20 // part):
         low = native.rasterize(case.splats, case.camera, settings)
-        high = reference.rasterize(double(case.splats), case.camera, settings)
-        default = reference.rasterize(double(case.splats), case.camera, SETTINGS)
+        high = PLAIN.rasterize(double(case.splats), case.camera, settings)
+        default = PLAIN.rasterize(double(case.splats), case.camera, SETTINGS)
         for name in ("color", "alpha", "distortion"):
             differences.append((getattr(low, name).double() - getattr(high, name)).abs().flatten())
         moved += float((high.color - default.color).abs().sum() + (high.distortion - default.distortion).abs().sum())
@@ -117,7 +116,7 @@ def test_gradients_agree_where_every_decision_has_a_margin(
     for case in clear_cases[columns // 4 :: 2 * part]:
         cotangents = random_cotangents(np.random.default_rng(case.seed), case.camera)
         low = gradients(native.rasterize, case.splats, case.camera, cotangents, columns, settings)
-        high = gradients(reference.rasterize, double(case.splats), case.camera, cotangents, columns, settings)
+        high = gradients(PLAIN.rasterize, double(case.splats), case.camera, cotangents, columns, settings)
         for name, expected in high.items():
             norm = float(expected.norm())
             if norm > 1e-3:
@@ -137,7 +136,7 @@ def test_gradients_of_each_image_alone_agree(native: Backend, part: int, clear_c
     for case in clear_cases[: 20 // part]:
         cotangents = {name: random_cotangents(np.random.default_rng(case.seed), case.camera)[name]}
         low = gradients(native.rasterize, case.splats, case.camera, cotangents, 4)
-        high = gradients(reference.rasterize, double(case.splats), case.camera, cotangents, 4)
+        high = gradients(PLAIN.rasterize, double(case.splats), case.camera, cotangents, 4)
         a = torch.cat([low[attribute].double().flatten() for attribute in ATTRIBUTES])
         b = torch.cat([high[attribute].flatten() for attribute in ATTRIBUTES])
         if float(b.norm()) > 1e-3:
@@ -156,9 +155,7 @@ def test_splat_errors_agree(native: Backend, part: int, occlusion: bool) -> None
         image = torch.tensor(rng.uniform(size=(H, W, 3)), dtype=torch.float32)
         mask = torch.tensor(rng.uniform(size=(H, W)) < 0.8) if case.seed % 2 else None
         low = native.splat_errors(case.splats, case.camera, image, SETTINGS, mask, occlusion).double()
-        high = reference_errors.splat_errors(
-            double(case.splats), case.camera, image.double(), SETTINGS, mask, occlusion
-        )
+        high = PLAIN.splat_errors(double(case.splats), case.camera, image.double(), SETTINGS, mask, occlusion)
         assert low.shape == high.shape
         relative.append((low - high).abs() / high.clamp(min=1))
     merged = torch.cat(relative)

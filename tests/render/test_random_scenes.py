@@ -20,8 +20,8 @@ from torch import Tensor
 import render_oracle
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
@@ -55,7 +55,7 @@ def random_scene(seed: int) -> tuple[Splats, Camera]:
 
 def gradients(native: Backend | None, splats: Splats, camera: Camera, seed: int) -> dict[str, Tensor]:
     scene = requiring_grad(splats)
-    run = reference.rasterize if native is None else native.rasterize
+    run = PLAIN.rasterize if native is None else native.rasterize
     cotangents = random_cotangents(np.random.default_rng(seed), camera)
     contraction(run(scene, camera, SETTINGS), cotangents).backward()
     return {name: getattr(scene, name).grad for name in ATTRIBUTES}
@@ -68,7 +68,7 @@ def compare(native: Backend, seeds: range) -> None:
     for seed in seeds:
         splats, camera = random_scene(seed)
         double = splats.to(dtype=torch.float64)
-        low, high = native.rasterize(splats, camera, SETTINGS), reference.rasterize(double, camera, SETTINGS)
+        low, high = native.rasterize(splats, camera, SETTINGS), PLAIN.rasterize(double, camera, SETTINGS)
         for name in IMAGES:
             a, b = getattr(low, name).double(), getattr(high, name)
             assert bool(a.isfinite().all()), (seed, name)

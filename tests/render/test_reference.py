@@ -14,7 +14,7 @@ import render_oracle
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.render import reference_projection as projection_reference
-from gs2d.render import reference_rasterizer as reference
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, KINDS, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
@@ -33,7 +33,7 @@ def test_the_reference_is_the_pixel_by_pixel_oracle() -> None:
     events: Counter[str] = Counter()
     for seed in range(60):
         splats, camera = small_scene(seed)
-        out = reference.rasterize(splats, camera, SETTINGS)
+        out = PLAIN.rasterize(splats, camera, SETTINGS)
         oracle = render_oracle.render(splats, camera, SETTINGS)
         events += oracle.events
         for name in IMAGES:
@@ -75,7 +75,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
         probe = torch.zeros(len(splats), 2, dtype=torch.float64, requires_grad=True)
 
         def scalar(*tensors: Tensor, camera: Camera = camera, cotangents: dict[str, Tensor] = cotangents) -> Tensor:
-            out = reference.rasterize(Splats(*tensors[:-1]), camera, SETTINGS, tensors[-1])
+            out = PLAIN.rasterize(Splats(*tensors[:-1]), camera, SETTINGS, tensors[-1])
             return contraction(out, cotangents)
 
         assert torch.autograd.gradcheck(scalar, (*inputs, probe), eps=1e-7, atol=1e-5, rtol=1e-5), seed
@@ -88,7 +88,7 @@ def test_absolute_columns_sum_the_absolute_signals_of_single_pixels() -> None:
     splats, camera = small_scene(5)
     cotangents = random_cotangents(np.random.default_rng(5), camera)
     probe = torch.zeros(len(splats), 4, dtype=torch.float64, requires_grad=True)
-    out = reference.rasterize(splats, camera, SETTINGS, probe)
+    out = PLAIN.rasterize(splats, camera, SETTINGS, probe)
     expected = torch.zeros(len(splats), 2, dtype=torch.float64)
     for row in range(camera.height):
         for column in range(camera.width):
@@ -104,10 +104,10 @@ def test_blocks_of_pixels_and_memory_limits_do_not_change_the_result(monkeypatch
     rng = np.random.default_rng(11)
     camera = random_camera(rng).resized(37, 21)
     splats = random_splats(rng, camera, 40)
-    whole = reference.rasterize(splats, camera, SETTINGS)
+    whole = PLAIN.rasterize(splats, camera, SETTINGS)
     monkeypatch.setattr(projection_reference, "TILE", 5)
     monkeypatch.setattr(projection_reference, "MAX_PAIRS", 64)
-    small = reference.rasterize(splats, camera, SETTINGS)
+    small = PLAIN.rasterize(splats, camera, SETTINGS)
     for name in (*IMAGES, "radii"):
         torch.testing.assert_close(getattr(small, name), getattr(whole, name), rtol=1e-12, atol=1e-12)
 
@@ -115,7 +115,7 @@ def test_blocks_of_pixels_and_memory_limits_do_not_change_the_result(monkeypatch
 def test_the_order_of_rows_does_not_matter_without_ties() -> None:
     splats, camera = small_scene(7, kinds=("plain", "tiny", "crossing"))
     shuffle = torch.randperm(len(splats), generator=torch.Generator().manual_seed(0))
-    out, mixed = (reference.rasterize(s, camera, SETTINGS) for s in (splats, splats.rows(shuffle)))
+    out, mixed = (PLAIN.rasterize(s, camera, SETTINGS) for s in (splats, splats.rows(shuffle)))
     for name in IMAGES:
         assert torch.equal(getattr(out, name), getattr(mixed, name)), name
     assert torch.equal(out.radii[shuffle], mixed.radii)
@@ -137,8 +137,8 @@ def test_moving_the_world_and_the_camera_together_changes_nothing() -> None:
     )
     moved_camera = replace(camera, T_cam_world=camera.T_cam_world @ np.linalg.inv(T_new_world))
     out, new = (
-        reference.rasterize(splats, camera, SETTINGS),
-        reference.rasterize(moved, moved_camera, SETTINGS),
+        PLAIN.rasterize(splats, camera, SETTINGS),
+        PLAIN.rasterize(moved, moved_camera, SETTINGS),
     )
     for name in IMAGES:
         expected = getattr(out, name) @ torch.tensor(turn).T if name == "normal" else getattr(out, name)
@@ -164,8 +164,8 @@ def test_float32_agrees_with_float64_up_to_rounding() -> None:
     for seed in range(30):
         splats, camera = small_scene(seed)
         single = splats.to(dtype=torch.float32)
-        low = reference.rasterize(single, camera, SETTINGS)
-        high = reference.rasterize(single.to(dtype=torch.float64), camera, SETTINGS)
+        low = PLAIN.rasterize(single, camera, SETTINGS)
+        high = PLAIN.rasterize(single.to(dtype=torch.float64), camera, SETTINGS)
         assert low.color.dtype == torch.float32
         differences.append((low.color - high.color).abs().flatten())
     merged = torch.cat(differences)

@@ -16,7 +16,6 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RecipeError
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.backends import Backend
 from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -40,7 +39,7 @@ def spoiled(spoil: Callable[[Splats, RenderOutput], RenderOutput], calls: int) -
         splats: Splats, camera: Camera, settings: RasterSettings, probe: torch.Tensor | None = None
     ) -> RenderOutput:
         count[0] += 1
-        output = reference.rasterize(splats, camera, settings, probe)
+        output = PLAIN.rasterize(splats, camera, settings, probe)
         return spoil(splats, output) if count[0] == calls else output
 
     return altered(PLAIN, rasterize=rasterize)

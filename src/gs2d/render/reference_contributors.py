@@ -7,8 +7,8 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
+from gs2d.render.reference_pairs import blend_weights, evaluate_pairs, pair_alpha
 from gs2d.render.reference_projection import MAX_PAIRS, cutoff_squared, project, screen_boxes, visible_rows
-from gs2d.render.reference_rasterizer import blend_weights, evaluate_pairs, pair_alpha
 from gs2d.render.types import Contributors, RasterSettings
 
 WIDENED = 1e-2  # px, on each side of a splat's box, so that rounding drops no pair that passes the exact tests

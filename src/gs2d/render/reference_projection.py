@@ -1,6 +1,6 @@
 """Projection of splats for the reference rasterizer (docs/math.md, "Projection" and "Footprint").
 
-This module works per splat, :mod:`gs2d.render.reference_rasterizer` per pair of splat and pixel.
+This module works per splat, :mod:`gs2d.render.reference_pairs` per pair of splat and pixel.
 """
 
 from __future__ import annotations

@@ -15,9 +15,9 @@ import torch
 from emulate import Emulator
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize
 from gs2d.render.cuda_backend import CudaBackend
+from gs2d.render.reference_backend import PLAIN
 from kernel_cases import SETTINGS, double, gradients, many_tiles, render
 from render_scenes import IMAGES, front_camera, random_cotangents, splat, stack
 
@@ -37,7 +37,7 @@ def test_lists_around_the_chunk_size_agree(emulator: Emulator, count: int) -> No
     assert float((low.color.double() - high.color).abs().max()) < 1e-5
     cotangents = random_cotangents(np.random.default_rng(count), camera)
     low_grads = gradients(partial(render, emulator), scene, camera, cotangents, 2)
-    high_grads = gradients(reference.rasterize, double(scene), camera, cotangents, 2)
+    high_grads = gradients(PLAIN.rasterize, double(scene), camera, cotangents, 2)
     for name in ("means", "opacity_logits", "sh0"):
         error = (low_grads[name].double() - high_grads[name]).norm() / high_grads[name].norm()
         assert float(error) < 1e-4, name

@@ -16,7 +16,6 @@ from emulate import Emulator
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.render import cuda_passes
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import PLAIN_COLORS, Features
@@ -78,7 +77,7 @@ def test_gradients_of_colours_alone_agree_with_the_reference(emulator: Emulator,
         cotangents = color_cotangent(case)
         found = gradients(launcher, case, cotangents, trained=COLORS)
         scene = requiring_grad(double(case.splats))
-        contraction(reference.rasterize(scene, case.camera, SETTINGS), cotangents).backward()
+        contraction(PLAIN.rasterize(scene, case.camera, SETTINGS), cotangents).backward()
         for name in COLORS:
             expected = getattr(scene, name).grad
             if expected is not None and float(expected.norm()) > 1e-3:

@@ -17,8 +17,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels.cuda.kernel_arguments import work_of
 from gs2d.render import cuda_passes, cuda_works
-from gs2d.render import reference_rasterizer as reference
 from gs2d.render.cuda_backend import CudaBackend
+from gs2d.render.reference_backend import PLAIN
 from kernel_cases import SETTINGS, double, many_tiles
 from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 
@@ -107,7 +107,7 @@ def test_pieces_give_the_images_and_gradients_of_whole_lists(
 def test_pieces_agree_with_the_reference(emulator: Emulator, deep: tuple[Splats, Camera]) -> None:
     found = rendered(emulator, deep)
     splats = requiring_grad(double(deep[0]))
-    output = reference.rasterize(splats, deep[1], EVERYTHING)
+    output = PLAIN.rasterize(splats, deep[1], EVERYTHING)
     cotangents = random_cotangents(np.random.default_rng(1), deep[1])
     (contraction(output, cotangents) + output.depth_transmittance.mean()).backward()
     close(found, {name: getattr(output, name).detach() for name in IMAGES}, 1e-4)
