@@ -33,11 +33,11 @@ def test_f_score_and_alignment_equal_open3d(figures: dict) -> None:
     truth = TntTruth("Barn", scene.scan, crop, scene.T_truth_log, scene.log)
     score = evaluate_tnt(Mesh(scene.vertices, scene.faces), NAMES, scene.centers, truth, TAU)
     for ours, theirs in zip(score.alignment.stages, figures["stages"], strict=True):
-        assert ours.points == theirs["points"]
-        assert ours.fraction_before == pytest.approx(theirs["share_before"], abs=1e-12)
-        assert ours.fraction == pytest.approx(theirs["share"], abs=1e-12)
-        assert ours.rms_before == pytest.approx(theirs["rms_before"], rel=1e-9)
-        assert ours.rms == pytest.approx(theirs["rms"], rel=1e-9)
+        assert ours["points"] == theirs["points"]
+        assert ours["fraction_before"] == pytest.approx(theirs["share_before"], abs=1e-12)
+        assert ours["fraction"] == pytest.approx(theirs["share"], abs=1e-12)
+        assert ours["rms_before"] == pytest.approx(theirs["rms_before"], rel=1e-9)
+        assert ours["rms"] == pytest.approx(theirs["rms"], rel=1e-9)
     np.testing.assert_allclose(score.alignment.T_truth_mesh, figures["stages"][-1]["T"], atol=1e-10)
     assert (score.mesh_points, score.truth_points) == (figures["mesh_points"], figures["truth_points"])
     for name in ("precision", "recall", "f_score", "accuracy", "completeness"):

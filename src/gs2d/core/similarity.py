@@ -41,15 +41,13 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
     return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
 
 
-def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool = True) -> np.ndarray:
+def umeyama(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the similarity [4, 4] with the least sum of |target - T source|^2 over pairs (Umeyama 1991, eq. 39 to 43).
 
     Parameters
     ----------
     source, target : ndarray [P, 3]
         Row i of one corresponds to row i of the other.
-    with_scale : bool
-        False: rotation and translation only.
 
     Raises
     ------
@@ -59,13 +57,13 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool = True) 
     check_shapes({"source": (source, "P 3"), "target": (target, "P 3")})
     if len(source) < 3:
         raise DataError(f"an alignment needs at least three corresponding points, got {len(source)}")
-    T, determined = umeyama_batch(source[None].astype(np.float64), target[None].astype(np.float64), with_scale)
+    T, determined = umeyama_batch(source[None].astype(np.float64), target[None].astype(np.float64))
     if not determined[0]:
         raise DataError("an alignment needs corresponding points that span a plane, got points on a line")
     return np.asarray(T[0])
 
 
-def umeyama_batch(source: np.ndarray, target: np.ndarray, with_scale: bool) -> tuple[np.ndarray, np.ndarray]:
+def umeyama_batch(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return similarities [B, 4, 4] of batches of pairs [B, n, 3], and which of them are determined [B]."""
     mean_s, mean_t = source.mean(axis=1), target.mean(axis=1)
     s, t = source - mean_s[:, None], target - mean_t[:, None]
@@ -77,8 +75,6 @@ def umeyama_batch(source: np.ndarray, target: np.ndarray, with_scale: bool) -> t
     determined = (D[:, 1] > 1e-9 * D[:, 0]) & (D[:, 0] > 0)
     scale = np.where(variance > 0, (D * signs).sum(axis=1) / np.where(variance > 0, variance, 1), 1.0)
     determined &= scale > 0
-    if not with_scale:
-        scale = np.ones_like(scale)
     T = np.zeros((len(source), 4, 4))
     T[:, :3, :3] = scale[:, None, None] * R
     T[:, :3, 3] = mean_t - np.einsum("bij,bj->bi", T[:, :3, :3], mean_s)

@@ -33,14 +33,6 @@ def test_a_known_similarity_is_found_to_rounding() -> None:
     assert rotation_degrees(KNOWN) == pytest.approx(130)
 
 
-def test_without_scale_the_best_rigid_motion_is_found() -> None:
-    rigid = similarity(1.0, rotation((0, 1, 1), 33), (1, 2, 3))
-    points = cube()
-    np.testing.assert_allclose(umeyama(points, moved(rigid, points), with_scale=False), rigid, atol=1e-12)
-    larger = umeyama(points, moved(KNOWN, points), with_scale=False)
-    assert similarity_scale(larger) == pytest.approx(1.0)
-
-
 def test_a_mirror_image_is_never_the_answer() -> None:
     points = cube()
     assert np.linalg.det(umeyama(points, points * (1, 1, -1.0))[:3, :3]) > 0

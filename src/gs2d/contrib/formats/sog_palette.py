@@ -12,8 +12,9 @@ _GROUP = 512  # rows of a palette
 _DISTANCES = 1 << 20  # per chunk; 4 MB fit in the cache
 
 
-def codebook(values: np.ndarray, count: int = 256) -> np.ndarray:
-    """Return ``count`` sorted codes, float32, for values [N], by one-dimensional k-means."""
+def codebook(values: np.ndarray) -> np.ndarray:
+    """Return 256 sorted codes, float32, for values [N], by one-dimensional k-means."""
+    count = 256
     if not len(values):
         return np.zeros(count, np.float32)
     ordered = np.sort(values.astype(np.float64).reshape(-1))

@@ -62,8 +62,11 @@ class _Level:
         return low, high
 
 
-def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians, *, levels: int | None = None) -> None:
+def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a ``lod-meta.json``, and the folders of its data sets beside it.
+
+    Each level has half of the splats of the previous one. There are 4, or up to 8 so that the coarsest has at most
+    250,000 splats.
 
     The index is written last, atomically, so it always refers to complete data sets. Then the data sets of an older
     index of the same name are removed. Other files in the folder are not changed.
@@ -74,24 +77,16 @@ def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians, *, le
         Its folder is created if it is missing.
     gaussians : Gaussians
         Disks.
-    levels : int, optional
-        Each level has half of the splats of the previous one. Default: 4, or up to 8 so that the coarsest has at most
-        250,000 splats.
 
     Raises
     ------
-    ValueError
-        If ``levels`` is below 1.
     DiskError
         If a file cannot be written.
     """
     path = Path(path)
-    wanted = _levels_for(len(gaussians)) if levels is None else levels
-    if wanted < 1:
-        raise ValueError(f"levels must be 1 or more, got {levels}")
     older = _listed(path)
     tree, cells = _divided(gaussians.means)
-    made = list(_made(gaussians, cells, int(cells.max(initial=0)) + 1, wanted))
+    made = list(_made(gaussians, cells, int(cells.max(initial=0)) + 1, _levels_for(len(gaussians))))
     with _new_folders(path) as folder:
         index = _written(path.parent, folder, made)
         bounds = [level.bounds() for level in made]

@@ -72,8 +72,6 @@ class IcpResult:
         Part of the source with a target within the threshold, at the start and at the end.
     rms_before, rms : float or None
         Of the distances of those; None where there are none.
-    converged : bool
-        Whether it stopped because nothing changed.
     """
 
     T_target_source: np.ndarray
@@ -82,7 +80,6 @@ class IcpResult:
     rms_before: float | None
     rms: float | None
     iterations: int
-    converged: bool
 
 
 def icp(
@@ -91,10 +88,8 @@ def icp(
     *,
     threshold: float,
     iterations: int,
-    with_scale: bool = True,
     fraction_change: float = 1e-6,
     rms_change: float = math.inf,
-    workers: int | None = None,
 ) -> IcpResult:
     """Move ``source`` [P, 3] onto ``target`` [Q, 3]: pair with the nearest, fit, repeat (Besl and McKay 1992).
 
@@ -104,28 +99,25 @@ def icp(
         Pairs farther apart do not count.
     iterations : int
         At most.
-    with_scale : bool
-        A similarity rather than a rigid motion.
     fraction_change, rms_change : float
         It has converged when the share of paired points and their rms change by less, both. The official Tanks and
         Temples script leaves the rms out in effect (it passes 20).
     """
-    cloud = Cloud(target, workers=workers)
+    cloud = Cloud(target)
     T = np.eye(4)
     moved = np.asarray(source, np.float64)
     fraction, rms, index, paired = _paired(cloud, moved, threshold)
-    first, done, converged = (fraction, rms), 0, False
+    first, done = (fraction, rms), 0
     for done in range(1, iterations + 1):  # noqa: B007
         if paired.sum() < 3:
             break
-        step = umeyama(moved[paired], cloud.points[index[paired]], with_scale=with_scale)
+        step = umeyama(moved[paired], cloud.points[index[paired]])
         T, moved = step @ T, apply(step, moved)
         before = (fraction, rms)
         fraction, rms, index, paired = _paired(cloud, moved, threshold)
         if abs(before[0] - fraction) < fraction_change and abs(before[1] - rms) < rms_change:
-            converged = True
             break
-    return IcpResult(T, first[0], fraction, first[1] if first[0] else None, rms if fraction else None, done, converged)
+    return IcpResult(T, first[0], fraction, first[1] if first[0] else None, rms if fraction else None, done)
 
 
 def _paired(cloud: Cloud, points: np.ndarray, threshold: float) -> tuple[float, float, np.ndarray, np.ndarray]:
@@ -140,6 +132,7 @@ def _paired(cloud: Cloud, points: np.ndarray, threshold: float) -> tuple[float, 
 
 # -- camera centres ----------------------------------------------------------------------------------------------------
 _BATCH = 256  # samples fitted at a time
+CONFIDENCE = 0.9999  # that a sample of inliers only was tried
 
 
 def rotation_degrees(T: np.ndarray) -> float:
@@ -179,13 +172,12 @@ def ransac_similarity(
     threshold: float,
     sample: int = 6,
     iterations: int = 10_000,
-    confidence: float = 0.9999,
     seed: int = 0,
 ) -> RobustFit:
     """Find the similarity with most pairs within ``threshold`` by random sampling (Fischler and Bolles 1981).
 
     The best sample is refined on its inliers until they no longer change. Stops early when a better sample is less
-    likely than 1 - confidence.
+    likely than 1 - CONFIDENCE.
 
     Parameters
     ----------
@@ -209,9 +201,9 @@ def ransac_similarity(
     sample = min(sample, count)
     rng = np.random.default_rng(seed)
     tried = 0
-    while tried < min(iterations, _needed(best.mean(), sample, confidence)):
+    while tried < min(iterations, _needed(best.mean(), sample)):
         rows = np.argsort(rng.random((_BATCH, count)), axis=1)[:, :sample]
-        T, determined = umeyama_batch(source[rows], target[rows], True)
+        T, determined = umeyama_batch(source[rows], target[rows])
         moved = np.einsum("bij,nj->bni", T[:, :3, :3], source) + T[:, None, :3, 3]
         inside = (np.linalg.norm(moved - target, axis=2) < threshold) & determined[:, None]
         counts = inside.sum(axis=1)
@@ -243,7 +235,7 @@ def _pair_distances(T: np.ndarray, source: np.ndarray, target: np.ndarray) -> np
     return np.asarray(np.linalg.norm(apply(T, source) - target, axis=1))
 
 
-def _needed(fraction: float, sample: int, confidence: float) -> float:
-    """Return the number of samples that contain one of inliers only, with this confidence."""
+def _needed(fraction: float, sample: int) -> float:
+    """Return the number of samples that contain one of inliers only, with the confidence."""
     good = float(fraction) ** sample
-    return math.inf if good <= 0 else 0 if good >= 1 else math.log(1 - confidence) / math.log1p(-good)
+    return math.inf if good <= 0 else 0 if good >= 1 else math.log(1 - CONFIDENCE) / math.log1p(-good)

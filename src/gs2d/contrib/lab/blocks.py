@@ -6,7 +6,7 @@ and finished tasks are not run again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -59,12 +59,23 @@ class BlocksTask(Task):
     ----------
     options : TrainOptions
         Options of one training of the whole scene; recipe and protocol are in ``blocks.json``.
+    step : callable
+        The function below that does the work, or continues it.
     block : str
         Name of the block, for tasks of one block.
     """
 
     options: TrainOptions
+    step: Callable[[BlocksTask, OnEvent], dict[str, Any]]
     block: str = ""
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Run the step; return entries of the record."""
+        return self.step(self, on_event)
+
+    def is_done(self) -> bool:
+        """Return whether the task is finished; a skipped block has no outputs."""
+        return super().is_done() or bool(self.outcome().get("skipped"))
 
     def with_threads(self, threads: int) -> BlocksTask:
         """Return the task with another number of CPU threads."""
@@ -101,112 +112,82 @@ class BlocksTask(Task):
         return found
 
 
-@dataclass(frozen=True, kw_only=True)
-class CoarseTask(BlocksTask):
+def train_coarse(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
     """Train the coarse model of the whole scene."""
-
-    def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Train, or continue."""
-        settled, partition = self.settled(on_event), self.partition()
-        downscale = coarse_downscale(settled.scene, partition, self.options.downscale or 1)
-        recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(self.options.out)
-        run = self.train(TrainedPart(recipe=recipe, protocol=settled.protocol), out, on_event, downscale=downscale)
-        return {"stages": run.metrics()["stages"]}
+    settled, partition = task.settled(on_event), task.partition()
+    downscale = coarse_downscale(settled.scene, partition, task.options.downscale or 1)
+    recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(task.options.out)
+    run = task.train(TrainedPart(recipe=recipe, protocol=settled.protocol), out, on_event, downscale=downscale)
+    return {"stages": run.metrics()["stages"]}
 
 
-@dataclass(frozen=True, kw_only=True)
-class PartitionTask(BlocksTask):
+def cut_coarse(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
     """Cut the coarse model into blocks."""
-
-    def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Cut."""
-        out, settled = self.options.out, self.settled(on_event)
-        coarse = open_run(coarse_folder(out))
-        make_folder(partition_folder(out))
-        splats = finished_splats(coarse).to(settled.backend.device)
-        found = split_model(
-            settled.trained(splats, with_learned_appearance(coarse, settled.recipe, settled.scene)),
-            self.partition(),
-            partition_folder(out),
-            on_event,
-        )
-        return {"blocks": {block.name: len(block.views) for block in found.blocks}}
+    out, settled = task.options.out, task.settled(on_event)
+    coarse = open_run(coarse_folder(out))
+    make_folder(partition_folder(out))
+    splats = finished_splats(coarse).to(settled.backend.device)
+    found = split_model(
+        settled.trained(splats, with_learned_appearance(coarse, settled.recipe, settled.scene)),
+        task.partition(),
+        partition_folder(out),
+        on_event,
+    )
+    return {"blocks": {block.name: len(block.views) for block in found.blocks}}
 
 
-@dataclass(frozen=True, kw_only=True)
-class BlockTask(BlocksTask):
+def train_block(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
     """Train one block, with the coarse model frozen around it."""
+    out, partition = task.options.out, task.partition()
+    split = read_split(partition_folder(out))
+    blocks = {block.name: block for block in split.blocks}
+    if task.block not in blocks:
+        raise RunError(f"{partition_folder(out)} has no block {task.block}; delete the folder and run this again")
+    block = blocks[task.block]
+    if block.skipped:
+        return {"skipped": block.skipped}
+    whole = recipe_from_json(settled_of(out)["recipe"])
+    recipe = block_recipe(whole, partition, block)
+    region = split.cells.region(split.cells.names.index(task.block))
+    start = start_file(partition_folder(out), task.block)
+    part = TrainedPart(
+        recipe=recipe,
+        protocol=task.protocol(),
+        views=block.views,
+        extent=block.extent if partition.extent == "block" else None,
+        **load_start(coarse_folder(out) / SPLATS, start, recipe, region),
+    )
+    run = task.train(part, block_folder(out, task.block), on_event)
+    return {"stages": run.metrics()["stages"]}
 
-    def is_done(self) -> bool:
-        """Return whether the block is trained, or skipped."""
-        done = self.outcome()
-        splats = block_folder(self.options.out, self.block) / SPLATS
-        return done["state"] == "done" and (bool(done.get("skipped")) or splats.exists())
 
-    def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Train, or continue."""
-        out, partition = self.options.out, self.partition()
-        split = read_split(partition_folder(out))
-        blocks = {block.name: block for block in split.blocks}
-        if self.block not in blocks:
-            raise RunError(f"{partition_folder(out)} has no block {self.block}; delete the folder and run this again")
-        block = blocks[self.block]
-        if block.skipped:
-            return {"skipped": block.skipped}
-        whole = recipe_from_json(settled_of(out)["recipe"])
-        recipe = block_recipe(whole, partition, block)
-        region = split.cells.region(split.cells.names.index(self.block))
-        start = start_file(partition_folder(out), self.block)
+def merge_blocks(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
+    """Crop each block to its cell and join them."""
+    return write_merged(task.settled(on_event), task.options, task.partition(), on_event)
+
+
+def train_seams(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
+    """Train the splats at seams once more, with all others frozen, and write the scene."""
+    out, settled, partition = task.options.out, task.settled(on_event), task.partition()
+    views = read_seam_views(out)
+    if views:
+        start = start_file(partition_folder(out), SEAMS)
+        trained = [len(block.views) for block in read_split(partition_folder(out)).blocks if not block.skipped]
+        recipe = seam_recipe(settled.recipe, partition, len(views) * len(trained) / max(1, sum(trained)))
         part = TrainedPart(
             recipe=recipe,
-            protocol=self.protocol(),
-            views=block.views,
-            extent=block.extent if partition.extent == "block" else None,
-            **load_start(coarse_folder(out) / SPLATS, start, recipe, region),
+            protocol=settled.protocol,
+            views=views,
+            **load_start(out / MERGED, start, recipe),
         )
-        run = self.train(part, block_folder(out, self.block), on_event)
-        return {"stages": run.metrics()["stages"]}
+        task.train(part, seam_folder(out), on_event)
+    return {"splats": write_result(settled, task.options, partition, on_event)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class MergeTask(BlocksTask):
-    """Crop each block to its cell and join them."""
-
-    def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Merge."""
-        return write_merged(self.settled(on_event), self.options, self.partition(), on_event)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SeamsTask(BlocksTask):
-    """Train the splats at seams once more, with all others frozen, and write the scene."""
-
-    def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Train, or continue, and write."""
-        out, settled, partition = self.options.out, self.settled(on_event), self.partition()
-        views = read_seam_views(out)
-        if views:
-            start = start_file(partition_folder(out), SEAMS)
-            trained = [len(block.views) for block in read_split(partition_folder(out)).blocks if not block.skipped]
-            recipe = seam_recipe(settled.recipe, partition, len(views) * len(trained) / max(1, sum(trained)))
-            part = TrainedPart(
-                recipe=recipe,
-                protocol=settled.protocol,
-                views=views,
-                **load_start(out / MERGED, start, recipe),
-            )
-            self.train(part, seam_folder(out), on_event)
-        return {"splats": write_result(settled, self.options, partition, on_event)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class FinishTask(BlocksTask):
+def finish_scene(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
     """Score and mesh the merged scene, write its page and report."""
-
-    def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Finish."""
-        settled = self.settled(on_event)
-        return finish_merged(settled, self.options, on_event)
+    settled = task.settled(on_event)
+    return finish_merged(settled, task.options, on_event)
 
 
 def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) -> list[BlocksTask]:
@@ -222,21 +203,27 @@ def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) 
     merged = (out / MERGED, out / SEAM_VIEWS)
     starts = {name: start_file(partition_folder(out), name) for name in partition.names}
     return [
-        CoarseTask(**common(COARSE), **whole, outputs=(coarse,)),
-        PartitionTask(**common(PARTITION, [COARSE]), **whole, inputs=(coarse,), outputs=(cells, *starts.values())),
+        BlocksTask(**common(COARSE), **whole, step=train_coarse, outputs=(coarse,)),
+        BlocksTask(
+            **common(PARTITION, [COARSE]), **whole, step=cut_coarse, inputs=(coarse,), outputs=(cells, *starts.values())
+        ),
         *(
-            BlockTask(
+            BlocksTask(
                 **common(task, [PARTITION]),
                 options=options,
                 memory=memory,
+                step=train_block,
                 block=name,
                 inputs=(coarse, cells, starts[name]),
+                outputs=(block_folder(out, name) / SPLATS,),
             )
             for task, name in zip(names, partition.names, strict=True)
         ),
-        MergeTask(**common(MERGE, names), **whole, inputs=(coarse, cells), outputs=merged),
-        SeamsTask(**common(SEAMS, [MERGE]), **whole, inputs=merged, outputs=(out / SPLATS,)),
-        FinishTask(**common(FINISH, [SEAMS]), **whole, inputs=(out / SPLATS,), outputs=(out / REPORT,)),
+        BlocksTask(**common(MERGE, names), **whole, step=merge_blocks, inputs=(coarse, cells), outputs=merged),
+        BlocksTask(**common(SEAMS, [MERGE]), **whole, step=train_seams, inputs=merged, outputs=(out / SPLATS,)),
+        BlocksTask(
+            **common(FINISH, [SEAMS]), **whole, step=finish_scene, inputs=(out / SPLATS,), outputs=(out / REPORT,)
+        ),
     ]
 
 

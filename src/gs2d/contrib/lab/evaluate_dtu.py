@@ -176,8 +176,6 @@ def evaluate_dtu(
     truth: DtuTruth,
     *,
     protocol: DtuSurface = DTU_SURFACE,
-    seed: int = 0,
-    workers: int | None = None,
 ) -> DtuScore:
     """Score a mesh in the frame of the scene.
 
@@ -187,8 +185,6 @@ def evaluate_dtu(
         Silhouettes of all views; (): nothing is culled.
     T_metric_scene : ndarray [4, 4]
         scale_mat: from the scene to mm.
-    workers : int, optional
-        Threads of the search for nearest points; default: all.
     """
     similarity_scale(T_metric_scene, "T_metric_scene")
     keep = inside_silhouettes(mesh.vertices.astype(np.float64), silhouettes, protocol)
@@ -196,9 +192,9 @@ def evaluate_dtu(
     used = keep if len(silhouettes) else np.ones(len(keep), bool)
     low, high = truth.bounds[0] - protocol.margin_low, truth.bounds[1] + protocol.margin_high
     points = mesh_points(_touching(culled, low, high), protocol.density, vertices=culled.vertices[used])
-    points = thin(points, protocol.density, seed=seed)
+    points = thin(points, protocol.density)
     points = points[((points >= low) & (points < high)).all(axis=1)]
-    return _score(points, truth, float(1 - used.mean()) if len(used) else 0.0, protocol, workers)
+    return _score(points, truth, float(1 - used.mean()) if len(used) else 0.0, protocol)
 
 
 def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
@@ -208,7 +204,7 @@ def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces[touch])
 
 
-def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurface, workers: int | None) -> DtuScore:
+def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurface) -> DtuScore:
     """Return the score of distances between the thinned points inside the box and the scan."""
     observed = points[truth.is_observed(points)]
     above = truth.above_plane()
@@ -224,8 +220,8 @@ def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurf
             message = "every corner of the mesh lies outside some silhouette: are the masks those of these views?"
         counts = (len(observed), len(above))
         return DtuScore(None, None, None, *counts, 1.0, 1.0, culled, False, (message,), clouds, why)
-    d2s = Cloud(truth.points, workers=workers).nearest(observed, limit=limit)[0][:, 0]
-    s2d = Cloud(points, workers=workers).nearest(above, limit=limit)[0][:, 0]
+    d2s = Cloud(truth.points).nearest(observed, limit=limit)[0][:, 0]
+    s2d = Cloud(points).nearest(above, limit=limit)[0][:, 0]
     clouds = ScoredClouds(observed, d2s, above, s2d, GREEN_WITHIN)
     near, back = np.isfinite(d2s), np.isfinite(s2d)
     dropped = (float(1 - near.mean()), float(1 - back.mean()))

@@ -16,6 +16,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -218,20 +219,6 @@ def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> t
 
 
 # -- the score ---------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class StageReport:
-    """One stage of the alignment: distances in m; None without pairs."""
-
-    voxel: float | None
-    threshold: float
-    points: int
-    fraction_before: float
-    fraction: float
-    rms_before: float | None
-    rms: float | None
-    iterations: int
-
-
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """The self-check.
@@ -256,6 +243,8 @@ class Alignment:
         Change of scale and rotation by the stages.
     transform_alone : float or None
         tau. rms error of the mesh with ``_trans.txt`` alone.
+    stages : tuple of dict
+        Of each stage: ``voxel`` and ``threshold`` (m), ``points``, and the numbers of ``IcpResult``.
     T_truth_mesh : ndarray [4, 4]
     """
 
@@ -270,7 +259,7 @@ class Alignment:
     shift_scale: float
     shift_degrees: float
     transform_alone: float | None
-    stages: tuple[StageReport, ...]
+    stages: tuple[dict[str, Any], ...]
     T_truth_mesh: np.ndarray
 
 
@@ -337,7 +326,7 @@ def evaluate_tnt(
     fit, frame_notes = _camera_fit(names, centers, truth, published, protocol)
     target = truth.crop.apply(truth.points).astype(np.float64)
     T = fit.T_target_source
-    reports: list[StageReport] = []
+    reports: list[dict[str, Any]] = []
     for stage in protocol.stages:
         step, report = _stage(source, target, T, truth, stage, tau, protocol)
         T = step.T_target_source @ T
@@ -394,7 +383,7 @@ def _stage(
     stage: IcpStage,
     tau: float,
     protocol: TntSurface,
-) -> tuple[IcpResult, StageReport]:
+) -> tuple[IcpResult, dict[str, Any]]:
     """Run one stage on the cropped and thinned clouds."""
     moved = truth.crop.apply(apply(T, source))
     if stage.voxel is None:
@@ -411,16 +400,9 @@ def _stage(
         fraction_change=protocol.fraction_change,
         rms_change=protocol.rms_change,
     )
-    report = StageReport(
-        None if stage.voxel is None else stage.voxel * tau,
-        stage.threshold * tau,
-        len(thin_source),
-        step.fraction_before,
-        step.fraction,
-        step.rms_before,
-        step.rms,
-        step.iterations,
-    )
+    voxel = None if stage.voxel is None else stage.voxel * tau
+    report = {"voxel": voxel, "threshold": stage.threshold * tau, "points": len(thin_source), **vars(step)}
+    del report["T_target_source"]
     return step, report
 
 
@@ -430,7 +412,7 @@ def _check(
     moved: np.ndarray,
     truth: TntTruth,
     tau: float,
-    stages: tuple[StageReport, ...],
+    stages: tuple[dict[str, Any], ...],
     messages: list[str],
     protocol: TntSurface,
 ) -> Alignment:
@@ -446,11 +428,12 @@ def _check(
             f"only {fit.fraction:.0%} of the cameras agree with {log} within {protocol.camera_threshold:g} m: "
             "is it the log of these photographs?"
         )
-    apart = not stages or stages[0].fraction < protocol.min_fraction
+    apart = not stages or stages[0]["fraction"] < protocol.min_fraction
     if apart or shift is None or shift > protocol.max_shift or abs(scale - 1) > protocol.max_scale_change:
+        near = stages[0]["fraction"] if stages else 0
         what = (
-            f"{stages[0].fraction if stages else 0:.0%} of the mesh lies within {protocol.stages[0].threshold:g} tau "
-            f"of the scan, after a shift of {'no' if shift is None else f'{shift:.1f}'} tau and a scale of {scale:.4f}"
+            f"{near:.0%} of the mesh lies within {protocol.stages[0].threshold:g} tau of the scan, after a shift of "
+            f"{'no' if shift is None else f'{shift:.1f}'} tau and a scale of {scale:.4f}"
         )
         trap = (
             f"the cameras fit {log}, the surface does not fit the scan: take {log} and {transform} from the official "

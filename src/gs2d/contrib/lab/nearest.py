@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,8 +18,6 @@ class Cloud:
     ----------
     points : ndarray [P, 3]
         Stored as float64 in ``points``; may be empty.
-    workers : int, optional
-        Number of threads (default: all cores).
 
     Raises
     ------
@@ -28,9 +25,8 @@ class Cloud:
         If a coordinate is not finite.
     """
 
-    def __init__(self, points: np.ndarray, *, workers: int | None = None) -> None:
+    def __init__(self, points: np.ndarray) -> None:
         self.points = _checked(points, "points")
-        self._workers = workers or os.cpu_count() or 1
         self._tree = cKDTree(self.points)
 
     def nearest(
@@ -60,7 +56,7 @@ class Cloud:
         """
         k = range(1, neighbours + 1)  # a list gives one column per neighbour, even for one
         queries = _checked(queries, "queries")
-        distances, index = self._tree.query(queries, k=k, distance_upper_bound=limit, workers=self._workers)
+        distances, index = self._tree.query(queries, k=k, distance_upper_bound=limit, workers=-1)
         return np.asarray(distances), np.asarray(index)
 
 

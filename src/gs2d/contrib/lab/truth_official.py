@@ -81,16 +81,8 @@ class DtuEvaluator:
         return {
             "unit": "mm",
             "ground_truth": str(truth.files["scan"]),
-            "chamfer": score.chamfer,
-            "accuracy": score.accuracy,
-            "completeness": score.completeness,
             "f_score": None,
-            "mesh_points": score.mesh_points,
-            "truth_points": score.truth_points,
-            "dropped_mesh": score.dropped_mesh,
-            "dropped_truth": score.dropped_truth,
-            "culled": score.culled,
-            "reason": score.reason,
+            **{name: value for name, value in vars(score).items() if name not in ("clouds", "ok", "messages")},
             "thresholds": [],
             "self_check": {"ok": score.ok, "messages": list(score.messages)},
             "protocol": asdict(DTU_SURFACE),
@@ -129,13 +121,8 @@ class TanksAndTemplesEvaluator:
         return {
             "unit": "m",
             "ground_truth": str(truth.files["scan"]),
-            **row,
-            "chamfer": score.chamfer,
-            "accuracy": score.accuracy,
-            "completeness": score.completeness,
-            "mesh_points": score.mesh_points,
-            "truth_points": score.truth_points,
-            "reason": score.reason,
+            "threshold": score.tau,
+            **{name: value for name, value in vars(score).items() if name not in ("clouds", "tau", "alignment")},
             "thresholds": [row],
             "self_check": _alignment(score.alignment),
             "protocol": asdict(TNT_SURFACE),
@@ -153,12 +140,8 @@ def _silhouettes(scene: Scene) -> list[ViewSilhouette]:
 
 
 def _alignment(alignment: Alignment) -> dict[str, Any]:
-    facts = {name: getattr(alignment, name) for name in Alignment.__dataclass_fields__}
-    return facts | {
-        "messages": list(alignment.messages),
-        "stages": [asdict(stage) for stage in alignment.stages],
-        "T_truth_mesh": alignment.T_truth_mesh.tolist(),
-    }
+    more = {"messages": list(alignment.messages), "stages": list(alignment.stages)}
+    return vars(alignment) | more | {"T_truth_mesh": alignment.T_truth_mesh.tolist()}
 
 
 def _written(folder: Path, names: Mapping[str, str]) -> dict[str, str]:

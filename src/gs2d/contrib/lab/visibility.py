@@ -13,25 +13,17 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.raycast import cast_camera
 
+MAX_SIDE = 800  # px, largest side of the depth maps
 NEAR = 1e-9  # world units; occluders at any distance count, in captures of any scale
 
 
-def visible_counts(
-    points: np.ndarray,
-    mesh: Mesh,
-    cameras: Sequence[Camera],
-    *,
-    tolerance: float,
-    max_side: int = 800,
-) -> np.ndarray:
+def visible_counts(points: np.ndarray, mesh: Mesh, cameras: Sequence[Camera], *, tolerance: float) -> np.ndarray:
     """Count the views in which each point [P, 3] is visible, with the mesh as the only occluder.
 
     Parameters
     ----------
     tolerance : float, world units
         See ``shown_points``.
-    max_side : int, px
-        Largest side of the depth maps.
 
     Returns
     -------
@@ -40,7 +32,7 @@ def visible_counts(
     vertices = mesh.vertices.astype(np.float64)
 
     def visible(camera: Camera) -> np.ndarray:
-        small = _shrunk(camera, max_side)
+        small = _shrunk(camera, MAX_SIDE)
         depths = cast_camera(vertices, mesh.faces, small, near=NEAR).depth
         return shown_points(points, small, depths, tolerance)
 
@@ -79,8 +71,8 @@ def _in_image(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
     return inside, v * camera.width + u, z
 
 
-def _shrunk(camera: Camera, max_side: int) -> Camera:
-    factor = max(camera.width, camera.height) / max_side
+def _shrunk(camera: Camera, MAX_SIDE: int) -> Camera:
+    factor = max(camera.width, camera.height) / MAX_SIDE
     if factor <= 1:
         return camera
     return camera.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
