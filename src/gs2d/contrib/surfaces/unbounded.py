@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -291,41 +292,40 @@ class _Nodes:
     def offsets(self) -> np.ndarray:
         return np.concatenate([[0], np.cumsum([len(v.keys) * VOXELS for v in self.volumes])])
 
+    def _by_level(self, ids: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Yield each level, where ``ids`` are its nodes, and the numbers of these nodes in it."""
+        offsets = self.offsets
+        for k in range(len(self.volumes)):
+            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
+            yield k, here, ids[here] - offsets[k]
+
     def gather(self, arrays: Sequence[np.ndarray], ids: np.ndarray) -> np.ndarray:
         """Return ``arrays`` [M, 512, ...] of the levels at the nodes ``ids`` [...]."""
         tail = arrays[0].shape[2:]
         out = np.zeros((*ids.shape, *tail), arrays[0].dtype)
-        offsets = self.offsets
-        for k, values in enumerate(arrays):
-            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
-            out[here] = values.reshape(-1, *tail)[ids[here] - offsets[k]]
+        for k, here, local in self._by_level(ids):
+            out[here] = arrays[k].reshape(-1, *tail)[local]
         return out
 
     def distances(self, ids: np.ndarray) -> np.ndarray:
         """Return signed distances in world units, because truncations differ between levels."""
-        out = np.zeros(ids.shape, np.float32)
-        offsets = self.offsets
-        for k, volume in enumerate(self.volumes):
-            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
-            out[here] = volume.tsdf.reshape(-1)[ids[here] - offsets[k]] * np.float32(volume.limits.truncation)
+        out = self.gather([volume.tsdf for volume in self.volumes], ids)
+        for k, here, _ in self._by_level(ids):
+            out[here] *= np.float32(self.volumes[k].limits.truncation)
         return out
 
     def valid(self, ids: np.ndarray) -> np.ndarray:
         """Whether voxels have enough weight to be known."""
         out = np.zeros(ids.shape, bool)
-        offsets = self.offsets
-        for k, volume in enumerate(self.volumes):
-            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
-            out[here] = volume.weight.reshape(-1)[ids[here] - offsets[k]] >= max(self.known_from[k], 1e-12)
+        for k, here, local in self._by_level(ids):
+            out[here] = self.volumes[k].weight.reshape(-1)[local] >= max(self.known_from[k], 1e-12)
         return out
 
     def positions(self, ids: np.ndarray) -> np.ndarray:
         """Return the world points [P, 3] of nodes [P]."""
         out = np.zeros((*ids.shape, 3))
-        offsets = self.offsets
-        for k, volume in enumerate(self.volumes):
-            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
-            local = ids[here] - offsets[k]
+        for k, here, local in self._by_level(ids):
+            volume = self.volumes[k]
             within = np.stack(np.unravel_index(local % VOXELS, (BLOCK,) * 3), axis=-1)
             grid = volume.blocks[local // VOXELS] * BLOCK + within
             out[here] = np.asarray(volume.limits.lower) + grid * volume.limits.voxel
@@ -453,32 +453,22 @@ class CascadeSurface:
         return Mesh(np.concatenate(self._vertices)[first], faces.astype(np.int32), colors)
 
 
+ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")  # of a volume, a row for each block; colours may be None
+
+
 def _rows_of(volume: Volume, rows: np.ndarray) -> Volume:
     """Return some blocks of a volume."""
-    return replace(
-        volume,
-        keys=volume.keys[rows],
-        tsdf=volume.tsdf[rows],
-        weight=volume.weight[rows],
-        color=None if volume.color is None else volume.color[rows],
-        color_weight=None if volume.color_weight is None else volume.color_weight[rows],
-    )
+    arrays = {name: getattr(volume, name) for name in ARRAYS}
+    some: dict[str, Any] = {name: None if array is None else array[rows] for name, array in arrays.items()}
+    return replace(volume, **some)
 
 
 def _kept_level(parts: Sequence[tuple[Volume, np.ndarray]]) -> tuple[Volume, np.ndarray]:
     """Merge the kept blocks of a level into one volume; also returns their rows in the level."""
-    volumes = [volume for volume, _ in parts]
-    colors = [volume.color for volume in volumes if volume.color is not None]
-    weights = [volume.color_weight for volume in volumes if volume.color_weight is not None]
-    whole = replace(
-        volumes[0],
-        keys=np.concatenate([volume.keys for volume in volumes]),
-        tsdf=np.concatenate([volume.tsdf for volume in volumes]),
-        weight=np.concatenate([volume.weight for volume in volumes]),
-        color=np.concatenate(colors) if colors else None,
-        color_weight=np.concatenate(weights) if weights else None,
-    )
-    return whole, np.concatenate([rows for _, rows in parts])
+    whole = parts[0][0]
+    there = [name for name in ARRAYS if getattr(whole, name) is not None]
+    every: dict[str, Any] = {name: np.concatenate([getattr(volume, name) for volume, _ in parts]) for name in there}
+    return replace(whole, **every), np.concatenate([rows for _, rows in parts])
 
 
 def _vertices(nodes: _Nodes, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
