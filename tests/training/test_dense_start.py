@@ -22,7 +22,7 @@ from gs2d.evaluation.image_metrics import psnr_float
 from gs2d.pipeline.train.run_logger import start_text
 from gs2d.render.api import rasterize
 from gs2d.training.events import Initialised
-from gs2d.training.start.plane_sweep import Sweep, averaged, sweep_views, unproject
+from gs2d.training.start.plane_sweep import Sweep, sweep_views
 from gs2d.training.start.start_fit import fit_start
 from gs2d.training.start.start_points import start_points
 from gs2d.training.start.sweep_range import sweep_range
@@ -83,35 +83,6 @@ def test_a_wall_is_swept_without_sparse_points() -> None:
 
 
 # -- points ----------------------------------------------------------------------------------------------------------
-def test_depth_maps_that_are_shifted_against_each_other_are_averaged() -> None:
-    views = sweep_views(wall(), replace(BALL, side=48, min_angle=1.0)).views
-    shifts = (1.01, 0.99, 1.0, 1.01, 0.99)
-    true = [WALL / unproject(view, np.ones(view.size))[..., 2] for view in views]  # the cameras stand at z = 0
-    depths = [shift * depth for shift, depth in zip(shifts, true, strict=True)]
-    depths[1][:, :10] = 0.0
-    depths[2][10:] *= 1.2  # another surface
-    found = averaged(views, depths, 0, (1, 2, 3, 4))
-    inner = slice(20, 30), slice(24, 34)
-    mean = 4 / sum(1 / shift for shift in (1.01, 0.99, 1.01, 0.99))
-    assert np.median((found / true[0])[inner]) == pytest.approx(mean, abs=1e-3)
-    assert not averaged(views, depths, 1, (0, 2))[:, :10].any()
-    np.testing.assert_allclose(averaged(views, depths, 2, (0, 1, 3, 4))[inner], depths[2][inner])
-
-
-@pytest.mark.parametrize(("angles", "differ"), [((0.0,) * 5, False), ((0.03, 0.0, -0.03, 0.03, -0.01), True)])
-def test_depth_maps_are_averaged_if_the_cameras_are_off(
-    angles: tuple[float, ...], differ: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    turned = (replace(view, camera=turn(view.camera, a)) for view, a in zip(wall().train, angles, strict=True))
-    scene, settings = replace(wall(), train=tuple(turned)), replace(BALL, side=48, min_angle=1.0)
-    # A pixel of these small images is 2.5 % of the depth, so depths that agree to 2 % are never 0.75 px apart.
-    monkeypatch.setattr("gs2d.training.start.plane_sweep.SHIFTED", 0.3)
-    found = sweep_views(scene, settings)
-    monkeypatch.setattr("gs2d.training.start.plane_sweep.FUSIONS", 0)
-    plain = sweep_views(scene, settings)
-    assert np.array_equal(found.depths[3], plain.depths[3]) is not differ
-
-
 def test_swept_points_lie_on_the_ball() -> None:
     cloud = start_points(ball(), swept_ball(), BALL)
     off = np.abs(np.linalg.norm(cloud.points, axis=1) - RADIUS)

@@ -28,8 +28,6 @@ from gs2d.training.start.sweep_range import SweepRange, sweep_range
 
 PLANES = 64  # depths that are tried for each pixel
 MIN_NCC = 0.5  # depths with a lower NCC are unknown
-FUSIONS = 3  # rounds of averaging with the depth maps of neighbours
-SHIFTED = 0.75  # px: they are averaged if they disagree more; with exact or well adjusted cameras it is 0.45 to 0.65
 AGREE = 0.02  # depths of two views agree when they differ by at most this fraction
 VOTES = 2  # neighbours that must agree on the depth of a splat
 MAX_VIEWS = 120  # images that are swept, evenly chosen, beside those that they are compared with
@@ -170,50 +168,7 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     views = Spilled(_trimming(_shrunk(view, known, factor) for view in scene.train), limit)
     neighbours = _neighbours(scene, views, known.observed, settings)
     found = Spilled(_trimming(_depths(views, index, neighbours[index]) for index in range(len(views))), limit)
-    depths: Sequence[np.ndarray] = found.column(0)
-    for _ in range(FUSIONS if _disagreement(views, depths, neighbours) > SHIFTED else 0):
-        before = depths
-        depths = Spilled((averaged(views, before, index, others) for index, others in enumerate(neighbours)), limit)
-    return Sweep(views, neighbours, depths, found.column(1))
-
-
-def _disagreement(
-    views: Sequence[SmallView], depths: Sequence[np.ndarray], neighbours: Sequence[Sequence[int]]
-) -> float:
-    """Return the median difference between the depths of neighbours that agree, in pixels at that depth."""
-    found = []
-    for index, others in enumerate(neighbours):
-        known = depths[index] > 0
-        places = unproject(views[index], depths[index])[known]
-        for other in others:
-            z, column, row, inside = project(views[other], places)
-            there = depths[other][row, column]
-            apart = np.abs(there - z)[inside & (there > 0)] / z[inside & (there > 0)]
-            if (apart <= AGREE).any():
-                found.append(np.median(apart[apart <= AGREE]) * views[index].K[0, 0])
-    return float(np.median(found or [0.0]))
-
-
-def averaged(
-    views: Sequence[SmallView], depths: Sequence[np.ndarray], index: int, neighbours: Sequence[int]
-) -> np.ndarray:
-    """Return the depth map [H, W] of a view, averaged in 1 / z with those of the neighbours that agree.
-
-    Errors of the cameras shift whole depth maps, differently for each pair, so they do not average out within a map.
-    """
-    depth = depths[index]
-    known = depth > 0
-    places, own = unproject(views[index], depth)[known], depth[known]
-    total, count = 1 / own, np.ones(len(own))
-    for other in neighbours:
-        z, column, row, inside = project(views[other], places)
-        there = depths[other][row, column]
-        agrees = inside & (there > 0) & (np.abs(there - z) <= AGREE * z)
-        total[agrees] += z[agrees] / (own * np.where(there > 0, there, 1))[agrees]
-        count += agrees
-    result = np.zeros_like(depth)
-    result[known] = count / total
-    return result
+    return Sweep(views, neighbours, found.column(0), found.column(1))
 
 
 def sweep_downscale(scene: Scene, settings: DenseStart) -> int:
