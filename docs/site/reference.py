@@ -7,10 +7,8 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 
-from gs2d.cli.help import TITLES, groups, option_text
-
 import gs2d
-from gs2d.cli.command_line import NAMES, Option, about, options_of
+from gs2d.cli.command_line import NAMES, TITLES, Option, about, groups, option_text, options_of
 
 _SPOKEN = re.compile(r"(`[^`]*`)")  # what is code already
 

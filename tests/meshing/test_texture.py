@@ -198,10 +198,10 @@ def test_other_programs_open_the_files_with_their_texture(tmp_path: Path, name: 
 def test_an_obj_file_is_replaced_with_its_material_and_texture_or_not_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("gs2d.io.meshes._lines", full)
+    monkeypatch.setattr("gs2d.io.meshes.np.savetxt", full)
     with pytest.raises(DiskError, match="No space left"):
         write_mesh(tmp_path / "a.obj", textured())
     assert list(tmp_path.iterdir()) == []
