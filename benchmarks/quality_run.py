@@ -29,7 +29,6 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.training import events
 from gs2d.training.events import ignore
-from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
 
@@ -124,7 +123,9 @@ def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
         while waiting and waiting[0] <= done:
             waiting.pop(0)
         with clocks.stopped():
-            course.append({"iterations": done, **asdict(clocks.spent()), **score(job, trainer.state)})
+            course.append(
+                {"iterations": done, **asdict(clocks.spent()), **score_splats(job, trainer.splats, trainer.scene_now())}
+            )
             _save(folder / STATE, trainer.state, clocks.spent(), course)
 
     every = PROGRESS_EVERY
@@ -139,8 +140,12 @@ def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
     )
     trainer.run()
     spent = clocks.spent()
-    result = {"iterations": job.recipe.iterations, **asdict(spent), **score(job, trainer.state)}
-    return {**result, **surface(job, trainer.state, spec, folder), "course": course}
+    result = {
+        "iterations": job.recipe.iterations,
+        **asdict(spent),
+        **score_splats(job, trainer.splats, trainer.scene_now()),
+    }
+    return {**result, **surface(job, trainer, spec, folder), "course": course}
 
 
 def _done(job: LoadedRun, state: TrainState | None) -> int:
@@ -165,13 +170,11 @@ def _save(file: Path, state: TrainState, spent: Spent, course: list[dict[str, An
     os.replace(temporary, file)
 
 
-def score(job: LoadedRun, state: TrainState) -> dict[str, Any]:
-    """Return the scores of the test views (of the training views if there are none), and the number of splats."""
-    return score_splats(job, state.splats, LearnedTable(job.recipe, job.scene).scene_now(state.learned))
-
-
 def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -> dict[str, Any]:
-    """Return the result of :func:`score` for splats, with the scene as learned with them."""
+    """Return the scores of the test views (of the training views if there are none), and the number of splats.
+
+    ``learned`` is the scene as learned with the splats.
+    """
     # Imported while the clocks are stopped: training does not need these modules.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.finish.scoring import score_views
@@ -185,7 +188,7 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
     return {"images": summary, "splats": len(splats), "longest_splat": round(size, 4)}
 
 
-def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
+def surface(job: LoadedRun, trainer: Trainer, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return the mesh quality and the meshing seconds, if there is a true surface."""
     from gs2d.contrib.lab.surface_protocols import VISIBLE_SURFACE
     from gs2d.evaluation.evaluators import GENERAL, choose_truth, score_surface
@@ -197,8 +200,8 @@ def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Pat
     if truth is None or truth.name != GENERAL:  # official metrics have no F-score at a fraction of the size
         return {"surface": None}
     start = time.process_time()
-    scene = LearnedTable(job.recipe, job.scene).scene_now(state.learned)
-    mesh = extract_mesh(Trained(state.splats, scene, job.protocol, job.settings, job.backend, job.recipe))
+    scene = trainer.scene_now()
+    mesh = extract_mesh(Trained(trainer.splats, scene, job.protocol, job.settings, job.backend, job.recipe))
     seconds = time.process_time() - start
     found = score_surface(mesh, truth, job.scene, folder=folder / "surface", tell=lambda text: None)
     fractions = map(str, VISIBLE_SURFACE.fractions)

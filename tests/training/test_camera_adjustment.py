@@ -46,7 +46,7 @@ def ball() -> Scene:
 
 @cache
 def disturbed(pixels: float = 0.4) -> tuple[Scene, np.ndarray]:
-    """Return the ball from cameras with errors of about so many pixels, and the true poses [V, 4, 4]."""
+    """Return the ball from cameras whose errors are about ``pixels``, and the true poses [V, 4, 4]."""
     scene, rng = ball(), np.random.default_rng(0)
     motions = rng.normal(size=(len(scene.train), 6)) * 0.6 * pixels / FOCAL
     motions[:, 3:] *= 3.0  # the distance of the ball

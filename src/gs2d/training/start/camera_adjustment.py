@@ -29,11 +29,11 @@ RADIUS = 3  # px: patches have 2 RADIUS + 1 pixels a side, as in the sweep
 MIN_NCC = 0.6  # of patches that match
 FARTHEST = 1.5  # px: matches are farther from their prediction only by mistake
 NOISE = 1 / 255  # standard deviation of grey values
-ROUNDS = 4  # of sweep and adjustment; one is enough for errors of a pixel
+ROUNDS = 4  # of sweep and adjustment; one is enough for errors up to a pixel of downscaled images
 TURNS, STEPS = 3, 4  # times that patches are matched again, and Gauss-Newton steps for each
 DOUBT = 4.0  # standard deviations of a match at which its weight is halved
 INDEPENDENT = 1 / 400  # share of the matches: neighbouring pixels, and pixels on the same highlight, err together
-EXPECTED = 0.5  # px of downscaled images: standard deviation of the given cameras
+EXPECTED = 0.5  # px of downscaled images: standard deviation of the errors of the given cameras
 GAIN = 0.9  # adjusted cameras are used if the median error across epipolar lines falls below this factor
 
 
@@ -118,7 +118,7 @@ def _pixels(sweep: Sweep, index: int) -> _Pixels:
     if sweep.neighbours[index] and min(depth.shape) > max(2 * RADIUS, CELL):
         texture = F.avg_pool2d(_gradients(view)[:, 1:].square().sum(dim=1, keepdim=True), 2 * RADIUS + 1, 1)
         worth[inner] = np.where(sweep.known(index)[inner], texture[0, 0].numpy(), 0)
-    height, width = len(worth) // CELL, worth[0].size // CELL
+    height, width = view.size[0] // CELL, view.size[1] // CELL
     squares = worth[: height * CELL, : width * CELL].reshape(height, CELL, width, CELL)
     cells = squares.transpose(0, 2, 1, 3).reshape(height, width, CELL * CELL)
     y, x = np.nonzero(cells.max(axis=2, initial=0) > TEXTURE)
