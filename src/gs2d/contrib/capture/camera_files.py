@@ -47,12 +47,7 @@ def register_file_reader(name: str, reader: FileReader, module: str) -> None:
 def real(value: Any, where: str) -> float:
     """Convert a number or its text to a finite float.
 
-    Raises
-    ------
-    UnusableViewError
-        For NaN or infinity; names ``where``.
-    DataError
-        For anything else; names ``where``.
+    Errors name ``where``: UnusableViewError for NaN or infinity, DataError for anything else.
     """
     kind: type[DataError] = DataError
     try:
@@ -68,13 +63,7 @@ def real(value: Any, where: str) -> float:
 
 
 def reals(value: Any, count: int, where: str) -> np.ndarray:
-    """Convert a list, or text separated by white space, to ``count`` finite numbers.
-
-    Raises
-    ------
-    DataError
-        If the count differs or an item is not a finite number.
-    """
+    """Convert a list, or text separated by white space, to ``count`` finite numbers, or raise DataError."""
     items = value.split() if isinstance(value, str) else value
     if not isinstance(items, Sequence) or len(items) != count:
         got = f"{len(items)}" if isinstance(items, Sequence) else type(value).__name__
@@ -113,15 +102,10 @@ _LOOKED_AT, _LOOKED_FROM = 2000, 100  # largest numbers of points and cameras in
 
 
 def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud | None, list[str]]:
-    """Return the points of a PLY file in ``root``, and a note if one is not used.
+    """Return the points of a PLY file in ``root``, and a note if one is not used. A damaged file is a DataError.
 
     Takes a file with a usual name (``points3D.ply``, ``points.ply``, ...), else the only one. Points may have been
     exported in other coordinates: they are left out if two cameras see less than half of them.
-
-    Raises
-    ------
-    DataError
-        If the file is damaged.
     """
     beside = [path for path in files_ending(root, ".ply") if path.name.lower() not in _TRUTHS]
     named = [path for name in _NAMES if (path := in_any_case(root, name)) in beside]
@@ -166,14 +150,8 @@ def _seen(points: np.ndarray, frames: Sequence[PosedImage]) -> float:
 def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np.ndarray:
     """Return T_cam_world of a camera-to-world matrix [3 or 4, 4]; the rotation is orthonormalised.
 
-    With ``opengl`` the axes y and z change sign: OpenGL cameras look along -z with y up.
-
-    Raises
-    ------
-    UnusableViewError
-        If a number is not finite.
-    DataError
-        If it is not a matrix or not a rigid motion.
+    With ``opengl`` the axes y and z change sign: OpenGL cameras look along -z with y up. Raises UnusableViewError if a
+    number is not finite, DataError if it is not a matrix or not a rigid motion.
     """
     try:
         M = np.asarray(matrix, dtype=np.float64)

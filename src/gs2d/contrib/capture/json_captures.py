@@ -38,12 +38,8 @@ _WHAT = {"mask_path": "mask", "depth_file_path": "depth map", "normal_file_path"
 def read_blender(root: Path) -> Capture:
     """Read ``transforms_train.json`` and ``transforms_test.json``; ``transforms_val.json`` is not used.
 
-    Without ``transforms_test.json`` the frames have no split. Poses are camera-to-world with OpenGL axes.
-
-    Raises
-    ------
-    DataError
-        If the JSON file is invalid or incomplete; names the file, the frame and the key.
+    Without ``transforms_test.json`` the frames have no split. Poses are camera-to-world with OpenGL axes. A DataError
+    about an invalid or incomplete file names the file, the frame and the key.
     """
     train, test = (in_any_case(root, name) for name in (TRAIN, TEST))
     if test.is_file():
@@ -55,16 +51,11 @@ def read_blender(root: Path) -> Capture:
 
 
 def read_nerfstudio(root: Path) -> Capture:
-    """Read ``transforms.json`` of nerfstudio or instant-ngp.
+    """Read ``transforms.json`` of nerfstudio or instant-ngp; errors as of ``read_blender``.
 
     Intrinsics and distortion are shared or per frame. Frames without a file are skipped and reported.
     ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) give the split, ``ply_file_path`` the sparse
     points. Coordinates are those of the file; ``applied_transform`` and ``scale`` are already applied to them.
-
-    Raises
-    ------
-    DataError
-        If the JSON file is invalid or incomplete; names the file, the frame and the key.
     """
     path = in_any_case(root, CAMERAS)
     meta = _read_meta(path)
@@ -196,13 +187,9 @@ def _relative(value: Any, where: str) -> str:
 def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intrinsics:
     """Return the intrinsics of a frame, from its own keys or the shared ones.
 
-    ``fl_x``, ``fl_y`` in pixels take precedence over the fields of view ``camera_angle_x``, ``camera_angle_y``:
-    f = 0.5 W / tan(0.5 angle). Without ``w``, ``h`` the size is that of the image file.
-
-    Raises
-    ------
-    DataError
-        If the focal length is missing, a value is not a number, or the camera model is not supported.
+    ``fl_x``, ``fl_y`` in pixels take precedence over the fields of view ``camera_angle_x``, ``camera_angle_y``: f = 0.5
+    W / tan(0.5 angle). Without ``w``, ``h`` the size is that of the image file. Raises DataError if the focal length is
+    missing, a value is not a number, or the camera model is not supported.
     """
 
     def number(key: str) -> float | None:

@@ -69,12 +69,8 @@ def read_metashape(root: Path) -> Capture:
     """Read the cameras of Metashape; unaligned and disabled cameras and those of other components are skipped.
 
     Images are found by their labels in ``images`` or elsewhere below the folder, sparse points in a PLY file beside the
-    cameras (``camera_files.points_beside``).
-
-    Raises
-    ------
-    DataError
-        If the file is missing or invalid, or a camera is not supported; names the file and the entry.
+    cameras (``camera_files.points_beside``). A DataError about an invalid file or an unsupported camera names the file
+    and the entry.
     """
     path = camera_file(root)
     if path is None:

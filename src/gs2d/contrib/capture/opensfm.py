@@ -46,14 +46,9 @@ def reconstruction_file(root: Path) -> Path | None:
 
 
 def read_opensfm(root: Path) -> Capture:
-    """Read the largest reconstruction in ``reconstruction.json``.
+    """Read the largest reconstruction in ``reconstruction.json``; a DataError names the file and the entry.
 
     Images are in ``images`` (OpenDroneMap: beside the folder ``opensfm``).
-
-    Raises
-    ------
-    DataError
-        If the file is invalid, or a camera is not supported; names the file and the entry.
     """
     path = reconstruction_file(root)
     if path is None:

@@ -30,18 +30,10 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes (y down, z forward) t
 
 @dataclass(frozen=True, eq=False)
 class SyntheticImage:
-    """One rendered view.
+    """One rendered view."""
 
-    Attributes
-    ----------
-    rgba : ndarray [H, W, 4] uint8
-        sRGB, straight alpha; colour is 0 where alpha is 0.
-    seen : ndarray [F] bool
-        Visible triangles.
-    """
-
-    rgba: np.ndarray
-    seen: np.ndarray
+    rgba: np.ndarray  # [H, W, 4] uint8 sRGB, straight alpha; colour is 0 where alpha is 0
+    seen: np.ndarray  # [F] bool: visible triangles
 
 
 def write_demo_capture(
@@ -56,28 +48,14 @@ def write_demo_capture(
 ) -> None:
     """Write a small synthetic capture in the NeRF-Synthetic layout, with the mesh that was rendered.
 
-    Writes RGBA PNG in ``train/`` and ``test/``, ``mesh_gt.ply``, ``mesh_gt_seen.npy`` (number of training views that
-    see each face, uint8) and, last, ``transforms_{train,test}.json``. Deterministic for any number of threads.
+    Writes RGBA PNG of ``size`` x ``size`` px in ``train/`` and ``test/``, ``mesh_gt.ply``, ``mesh_gt_seen.npy`` (number
+    of training views that see each face, uint8) and, last, ``transforms_{train,test}.json``; files of an earlier
+    capture are replaced. Deterministic for any number of ``threads`` (default: the cores, at most 8). The seed is for
+    the twigs, the textures, and small motions of the cameras. ``on_progress`` gets (images done, number of images)
+    after each image, from the calling thread.
 
-    Parameters
-    ----------
-    folder : path
-        Created if missing; files of an earlier capture are replaced.
-    seed : int
-        For the twigs, the textures, and small motions of the cameras.
-    size : int
-        Width and height, px.
-    on_progress : callable, optional
-        Called with (images done, number of images) after each image, from the calling thread.
-    threads : int, optional
-        Default: the number of cores, at most 8.
-
-    Raises
-    ------
-    DataError
-        If there is no training view, or the size is less than 16 px.
-    DiskError
-        If a file could not be written.
+    Raises DataError if there is no training view, or the size is less than 16 px; DiskError if a file could not be
+    written.
     """
     if train_views < 1 or test_views < 0 or size < 16:
         raise DataError(

@@ -15,35 +15,20 @@ RADIUS = 1.08  # world units, of the plinth
 
 @dataclass(frozen=True, eq=False)
 class DemoPart:
-    """An object of the scene.
-
-    Attributes
-    ----------
-    patch : Patch
-    texture : ndarray [rows, columns, 3] float32, linear light
-    gloss : float
-        Strength of the highlight; 0 is matt.
-    """
+    """An object of the scene."""
 
     name: str
     patch: shapes.Patch
-    texture: np.ndarray
-    gloss: float = 0.0
+    texture: np.ndarray  # [rows, columns, 3] float32, linear light
+    gloss: float = 0.0  # strength of the highlight; 0 is matt
 
 
 @dataclass(frozen=True, eq=False)
 class ToyScene:
-    """All parts as one list of triangles.
-
-    Attributes
-    ----------
-    patch : Patch
-        The joined parts.
-    part_of_face : ndarray [F] int64
-    """
+    """All parts as one list of triangles."""
 
     parts: tuple[DemoPart, ...]
-    patch: shapes.Patch
+    patch: shapes.Patch  # the joined parts
     part_of_face: np.ndarray  # [F]
 
 

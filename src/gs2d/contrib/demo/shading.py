@@ -20,18 +20,10 @@ _LIFT = 2e-3  # world units, offset of shadow rays from the surface
 
 @dataclass(frozen=True, eq=False)
 class BakedLight:
-    """View-independent light at each vertex.
+    """View-independent light at each vertex."""
 
-    Attributes
-    ----------
-    sky : ndarray [P, 3]
-        Irradiance from the sky and the ground, divided by pi; 1 is an open, white, upward-facing patch.
-    lamp : ndarray [P]
-        Visible fraction of the lamp, times the cosine of incidence.
-    """
-
-    sky: np.ndarray
-    lamp: np.ndarray
+    sky: np.ndarray  # [P, 3] irradiance from sky and ground, divided by pi; 1 is an open, white, upward-facing patch
+    lamp: np.ndarray  # [P] visible fraction of the lamp, times the cosine of incidence
 
 
 def bake(
@@ -151,25 +143,11 @@ def _albedo(scene: ToyScene, uv: np.ndarray, part: np.ndarray) -> np.ndarray:
 def occluded(
     vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, direction: np.ndarray, *, cells: int = 256
 ) -> np.ndarray:
-    """Whether the ray from each point towards a distant light hits a triangle.
+    """Whether the ray from each point towards a distant light hits a triangle, bool [Q].
 
-    Projected along the light, a ray is a point and a triangle is a 2D triangle. Points and triangles are binned on a
-    grid across the light, and a point is compared with the triangles that overlap its cell.
-
-    Parameters
-    ----------
-    vertices : ndarray [P, 3] world units
-    faces : ndarray [F, 3] int
-    points : ndarray [Q, 3] world units
-        Origins, moved off their surface.
-    direction : ndarray [3]
-        Unit vector towards the light.
-    cells : int
-        Cells of the grid along each axis.
-
-    Returns
-    -------
-    ndarray [Q] bool
+    Points [Q, 3] are origins moved off their surface; ``direction`` [3] is the unit vector towards the light. Projected
+    along the light, a ray is a point and a triangle is a 2D triangle. Points and triangles are binned on a grid of
+    ``cells`` x ``cells`` across the light, and a point is compared with the triangles that overlap its cell.
     """
     axes = _frame(direction)  # rows: across, across, towards the light
     corners = (vertices @ axes.T)[faces]  # [F, 3, 3]

@@ -13,20 +13,12 @@ _SAME_POINT = 1e-7  # world units, vertices closer than this are merged
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Triangles with shading normals and texture coordinates; vertices on a texture seam are repeated.
+    """Triangles with shading normals and texture coordinates; vertices on a texture seam are repeated."""
 
-    Attributes
-    ----------
-    vertices : ndarray [P, 3] world units
-    normals : ndarray [P, 3] unit, outwards
-    uvs : ndarray [P, 2]
-    faces : ndarray [F, 3] int64, counter-clockwise seen from outside
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    uvs: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray  # [P, 3] world units
+    normals: np.ndarray  # [P, 3] unit, outwards
+    uvs: np.ndarray  # [P, 2]
+    faces: np.ndarray  # [F, 3] int64, counter-clockwise seen from outside
 
     def moved(self, *, offset: Sequence[float] | np.ndarray = (0, 0, 0), turn: float = 0.0) -> Patch:
         """Return the patch rotated about z by ``turn`` radians, then translated by ``offset`` world units."""

@@ -22,13 +22,7 @@ _RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1",
 
 
 def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a ``.splat`` file, atomically, by decreasing importance and with colours of SH degree 0 only.
-
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
-    """
+    """Write a ``.splat`` file, atomically, by decreasing importance and with colours of SH degree 0 only."""
     opacity = sigmoid(gaussians.opacity_logits)
     importance = gaussians.log_scales.sum(axis=1, dtype=np.float64) + np.log(np.maximum(opacity, 1e-300))
     order = np.argsort(-importance, kind="stable")
@@ -44,13 +38,7 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def read_splat(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a ``.splat`` file. It has no header, so its size and values are checked.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, has an incomplete record, or has invalid values.
-    """
+    """Read a ``.splat`` file. It has no header, so a DataError reports an incomplete record or invalid values."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:

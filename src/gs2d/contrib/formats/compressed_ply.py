@@ -35,18 +35,7 @@ _SPAN = {
 
 
 def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> tuple[str, ...]:
-    """Write a compressed PLY, atomically, in Morton order.
-
-    Returns
-    -------
-    tuple of str
-        Messages about values that the format cannot represent.
-
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
-    """
+    """Write a compressed PLY, atomically, in Morton order; return messages about unrepresentable values."""
     n = len(gaussians)
     g = gaussians.rows(morton_order(gaussians.means))
     chunks = -(-n // _CHUNK)
@@ -131,10 +120,7 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
 def read_compressed_ply(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
     """Read a compressed PLY, in file order; ``tell`` receives a message if SH bands are dropped.
 
-    Raises
-    ------
-    DataError
-        If the file is broken, no PLY, or has inconsistent elements.
+    Raises DataError if the file is broken, no PLY, or has inconsistent elements.
     """
     file = read_ply(path)
     vertex, chunk = _elements(path, file)

@@ -34,13 +34,7 @@ _KNOWN = {EXTENSION, "KHR_mesh_quantization"}
 
 
 def write_gltf(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a .glb file, atomically.
-
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
-    """
+    """Write a .glb file, atomically."""
     count = len(gaussians)
     attributes = _attributes(gaussians)
     views: list[dict[str, Any]] = []
@@ -120,12 +114,8 @@ def _places(degree: int) -> list[tuple[int, int]]:
 def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
     """Read all splats in the scene of a .glb or .gltf file; also returns the kind of file.
 
-    ``tell`` receives a message if SH bands above degree 3 are dropped.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, no glTF, or contains no splats or unsupported ones.
+    ``tell`` receives a message if SH bands above degree 3 are dropped. Raises DataError if the file is no glTF, or
+    contains no splats or unsupported ones.
     """
     document = read_document(path)
     required = document.json.get("extensionsRequired", [])
@@ -152,13 +142,7 @@ def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple
 
 
 def gltf_mesh(path: str | os.PathLike[str]) -> dict[str, int | str] | None:
-    """Return the numbers of vertices and triangles of a .glb or .gltf file, and its colours; None without a mesh.
-
-    Raises
-    ------
-    DataError
-        If the file is missing or no glTF.
-    """
+    """Return the numbers of vertices and triangles of a .glb or .gltf file, and its colours; None without a mesh."""
     document = read_document(path)
     vertices = triangles = 0
     colors = "none"

@@ -72,10 +72,7 @@ class GltfDocument:
     def array(self, index: int, kind: str) -> np.ndarray:
         """Read an accessor of a type ("VEC3") as float32 [N, width]; integers are normalised if flagged.
 
-        Raises
-        ------
-        DataError
-            Or an error that ``reading`` converts to one.
+        Raises DataError, or an error that ``reading`` converts to one.
         """
         accessor = self.json["accessors"][_whole(index)]
         if accessor["type"] != kind or "sparse" in accessor or "bufferView" not in accessor:
@@ -139,13 +136,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def read_document(path: str | os.PathLike[str]) -> GltfDocument:
-    """Read a .glb or .gltf file without its external files.
-
-    Raises
-    ------
-    DataError
-        If the file is missing or no glTF 2.0.
-    """
+    """Read a .glb or .gltf file without its external files; raises DataError if it is missing or no glTF 2.0."""
     data, inside = _bytes(Path(path)), None
     text = data
     if data[:4] == b"glTF":

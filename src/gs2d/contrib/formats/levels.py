@@ -24,19 +24,10 @@ _PASSES = 12  # of merging disjoint pairs, until half of the splats are left
 
 
 def halved(g: Gaussians, cells: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return half as many disks with a similar appearance from a distance, and their cells.
+    """Return half as many disks [M] with a similar appearance from a distance, and their cells [M].
 
-    Parameters
-    ----------
-    g : Gaussians
-        Disks; their third scale is ignored.
-    cells : ndarray [N] int
-        Only splats in the same cell are merged, so that each cell can be shown at its own level.
-
-    Returns
-    -------
-    Gaussians, ndarray [M] int
-        M is half of N, or more if splats have no neighbours in their cells.
+    Only splats with the same number in ``cells`` [N] are merged, so that each cell can be shown at its own level. M is
+    more than half of N if splats have no neighbours in their cells. The third scale of disks is ignored.
     """
     target = (len(g) + 1) // 2
     for _ in range(_PASSES):

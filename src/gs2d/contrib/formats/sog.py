@@ -39,13 +39,7 @@ Fetch = Callable[[str], bytes]
 
 
 def write_sog(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write one .sog file (version 2), atomically and deterministically, in Morton order.
-
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
-    """
+    """Write one .sog file (version 2), atomically and deterministically, in Morton order."""
     files = packed_sog(gaussians.rows(morton_order(gaussians.means)))
     with atomic_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():
@@ -136,12 +130,8 @@ def _packed_harmonics(shN: np.ndarray, shape: tuple[int, int]) -> tuple[dict[str
 def read_sog(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
     """Read a .sog file, the meta.json of a folder, or the finest level of a lod-meta.json.
 
-    ``tell`` receives a message if SH bands above degree 3 are dropped.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, damaged, or of another kind or version.
+    ``tell`` receives a message if SH bands above degree 3 are dropped. Raises DataError if the file is missing,
+    damaged, or of another kind or version.
     """
     path = Path(path)
     try:

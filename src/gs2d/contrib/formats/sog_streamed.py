@@ -63,25 +63,13 @@ class _Level:
 
 
 def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a ``lod-meta.json``, and the folders of its data sets beside it.
+    """Write a ``lod-meta.json`` in a folder that is created if missing, and the folders of its data sets beside it.
 
     Each level has half of the splats of the previous one. There are 4, or up to 8 so that the coarsest has at most
     250,000 splats.
 
     The index is written last, atomically, so it always refers to complete data sets. Then the data sets of an older
     index of the same name are removed. Other files in the folder are not changed.
-
-    Parameters
-    ----------
-    path : path
-        Its folder is created if it is missing.
-    gaussians : Gaussians
-        Disks.
-
-    Raises
-    ------
-    DiskError
-        If a file cannot be written.
     """
     path = Path(path)
     older = _listed(path)

@@ -62,23 +62,10 @@ _WORDS = (1 << 9) - 1
 
 
 def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: int = 3) -> tuple[str, ...]:
-    """Write SPZ of version 3 or 4, atomically and deterministically.
+    """Write SPZ of version 3 or 4, atomically and deterministically; returns messages about unrepresentable splats.
 
     The step of positions is at most a 64th of the median splat size, if the farthest position leaves enough bits.
-
-    Returns
-    -------
-    tuple of str
-        Messages about splats that the format cannot represent.
-
-    Raises
-    ------
-    DataError
-        If a position exceeds 2^23 units.
-    BackendError
-        For version 4 without zstandard.
-    DiskError
-        If the file could not be written.
+    Raises DataError if a position exceeds 2^23 units, BackendError for version 4 without zstandard.
     """
     g = gaussians.mirrored((1, -1, -1))
     farthest = float(np.abs(g.means).max()) if len(g) else 0.0
@@ -173,20 +160,9 @@ def _losses(g: Gaussians) -> tuple[str, ...]:
 def read_spz(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, int]:
     """Read SPZ of version 2, 3 or 4; returns (Gaussians, version).
 
-    The smallest scale of SPZ, 4.5e-5 units, is read as the thickness of a disk if it is the third.
-
-    Parameters
-    ----------
-    path : path
-    tell : callable
-        Receives a message if SH bands above degree 3 are dropped.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, of another kind or version, or truncated.
-    BackendError
-        For version 4 without zstandard.
+    The smallest scale of SPZ, 4.5e-5 units, is read as the thickness of a disk if it is the third. ``tell`` receives a
+    message if SH bands above degree 3 are dropped. Raises DataError if the file is missing, of another kind or version,
+    or truncated, and BackendError for version 4 without zstandard.
     """
     try:
         packed = Path(path).read_bytes()

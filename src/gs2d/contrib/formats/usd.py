@@ -52,13 +52,7 @@ _AGREE = 2e-6  # tolerance; rounding of exp and log is smaller
 
 
 def required_usd() -> Any:
-    """Import OpenUSD's package pxr.
-
-    Raises
-    ------
-    BackendError
-        If it is not installed.
-    """
+    """Import OpenUSD's package pxr, or raise BackendError."""
     try:
         for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdVol", "Vt"):
             importlib.import_module(f"pxr.{name}")
@@ -68,16 +62,9 @@ def required_usd() -> Any:
 
 
 def write_usd(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a binary OpenUSD file, atomically and deterministically.
+    """Write a binary OpenUSD file, atomically and deterministically, or raise BackendError without OpenUSD.
 
     The stage states z-up and metres, which is true for georeferenced splats only; coordinates are not changed.
-
-    Raises
-    ------
-    BackendError
-        If OpenUSD is not installed.
-    DiskError
-        If the file could not be written.
     """
     pxr = required_usd()
     stage = pxr.Usd.Stage.CreateInMemory("splats.usdc")
@@ -155,14 +142,9 @@ def _save(pxr: Any, path: Path, layer: Any) -> None:
 def read_usd(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
     """Read all particle fields of an OpenUSD file, in the frame of its stage; also returns their kernels.
 
-    The third scale of surflets is ignored. ``tell`` receives a message if SH bands above degree 3 are dropped.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, no OpenUSD, or has no such fields, or an unsupported kernel or transform.
-    BackendError
-        If OpenUSD is not installed.
+    The third scale of surflets is ignored. ``tell`` receives a message if SH bands above degree 3 are dropped. Raises
+    DataError if the file is missing, no OpenUSD, or has no such fields, or an unsupported kernel or transform, and
+    BackendError if OpenUSD is not installed.
     """
     facts, data = _ask(path)
     fields, at = [], 0

@@ -22,24 +22,15 @@ NOT_YET = ("not trained yet", "under way or interrupted")
 
 @dataclass(frozen=True)
 class Cell:
-    """The figures of one run.
-
-    Attributes
-    ----------
-    figures : dict
-        One entry for each of FIGURES; None where there is none.
-    reasons : dict
-        Reasons of figures that are None.
-    details : dict
-        Further facts: splats, surface thresholds, image metrics of each stage, measured views.
-    """
+    """The figures of one run."""
 
     scene: str
     data_set: str
     seed: int
-    figures: dict[str, float | None]
-    reasons: dict[str, str]
+    figures: dict[str, float | None]  # one entry for each of FIGURES; None where there is none
+    reasons: dict[str, str]  # why figures are None
     run: Path
+    # splats, surface thresholds, metrics of each stage, measured views
     details: dict[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -185,14 +176,8 @@ def read_cell(
 ) -> Cell:
     """Return the figures of a run from its ``metrics.json``; missing ones are None, with a reason.
 
-    Parameters
-    ----------
-    test_on : str
-        "test" or "train": the views whose image metrics count.
-    record : dict
-        Outcome of the task of the run.
-    conventions : MetricConventions
-        Of the protocol: which image metrics count, and the main figure of the surface.
+    ``test_on`` ("test" or "train") names the views whose image metrics count, ``record`` is the outcome of the task of
+    the run. The protocol's ``conventions`` say which image metrics count, and the main figure of the surface.
     """
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
     place: dict[str, Any] = {"scene": scene, "data_set": data_set, "seed": seed, "run": run}
@@ -264,27 +249,15 @@ def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, 
 # -- claims ----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class StageStep:
-    """The difference of two neighbouring rows of a claim, in the direction of the paper.
-
-    Attributes
-    ----------
-    lower, upper : str
-        Rows; in the paper ``upper`` is better (or not worse, or equal).
-    difference : float
-        Mean over scenes and seeds of upper minus lower, with inverted sign if lower values are better.
-    spread : float or None
-        Standard deviation over seeds of the mean over scenes of the difference.
-    seeds_with_sign : int
-        Number of seeds with the order of the paper.
-    """
+    """The difference of two neighbouring rows of a claim, in the direction of the paper."""
 
     lower: str
-    upper: str
+    upper: str  # the row that is better in the paper (or not worse, or equal)
     metric: str
-    difference: float
-    spread: float | None
+    difference: float  # mean over scenes and seeds of upper minus lower, with inverted sign if lower values are better
+    spread: float | None  # standard deviation over seeds of the mean over scenes of the difference
     seeds: int
-    seeds_with_sign: int
+    seeds_with_sign: int  # seeds with the order of the paper
 
 
 @dataclass(frozen=True)

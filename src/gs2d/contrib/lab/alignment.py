@@ -63,21 +63,12 @@ def uniform_downsample(points: np.ndarray, limit: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class IcpResult:
-    """What an alignment found.
+    """What an alignment found."""
 
-    Attributes
-    ----------
-    T_target_source : ndarray [4, 4]
-    fraction_before, fraction : float
-        Part of the source with a target within the threshold, at the start and at the end.
-    rms_before, rms : float or None
-        Of the distances of those; None where there are none.
-    """
-
-    T_target_source: np.ndarray
-    fraction_before: float
-    fraction: float
-    rms_before: float | None
+    T_target_source: np.ndarray  # [4, 4]
+    fraction_before: float  # part of the source with a target within the threshold, at the start
+    fraction: float  # and at the end
+    rms_before: float | None  # of the distances of those; None where there are none
     rms: float | None
     iterations: int
 
@@ -93,15 +84,9 @@ def icp(
 ) -> IcpResult:
     """Move ``source`` [P, 3] onto ``target`` [Q, 3]: pair with the nearest, fit, repeat (Besl and McKay 1992).
 
-    Parameters
-    ----------
-    threshold : float
-        Pairs farther apart do not count.
-    iterations : int
-        At most.
-    fraction_change, rms_change : float
-        It has converged when the share of paired points and their rms change by less, both. The official Tanks and
-        Temples script leaves the rms out in effect (it passes 20).
+    Pairs farther apart than ``threshold`` do not count. It has converged when the share of paired points and their rms
+    change by less than ``fraction_change`` and ``rms_change``, both; the official Tanks and Temples script leaves the
+    rms out in effect (it passes 20).
     """
     cloud = Cloud(target)
     T = np.eye(4)
@@ -143,21 +128,12 @@ def rotation_degrees(T: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RobustFit:
-    """A similarity that most pairs agree with.
+    """A similarity that most pairs agree with."""
 
-    Attributes
-    ----------
-    T_target_source : ndarray [4, 4]
-    inliers : ndarray [P] bool
-        Pairs closer than the threshold.
-    rms, worst : float
-        Root mean square and largest distance of the inliers, target units.
-    """
-
-    T_target_source: np.ndarray
-    inliers: np.ndarray
-    rms: float
-    worst: float
+    T_target_source: np.ndarray  # [4, 4]
+    inliers: np.ndarray  # [P] bool: pairs closer than the threshold
+    rms: float  # of the distances of the inliers, target units
+    worst: float  # largest of these distances
 
     @property
     def fraction(self) -> float:
@@ -176,22 +152,10 @@ def ransac_similarity(
 ) -> RobustFit:
     """Find the similarity with most pairs within ``threshold`` by random sampling (Fischler and Bolles 1981).
 
-    The best sample is refined on its inliers until they no longer change. Stops early when a better sample is less
-    likely than 1 - CONFIDENCE.
-
-    Parameters
-    ----------
-    source, target : ndarray [P, 3]
-        Corresponding points, such as the camera centres of two reconstructions.
-    threshold : float
-        Target units.
-    sample : int
-        Pairs per sample, if there are as many.
-
-    Raises
-    ------
-    DataError
-        If there are fewer than three pairs, all are on one line, or no three agree.
+    ``source`` and ``target`` [P, 3] are corresponding points, such as the camera centres of two reconstructions; the
+    threshold is in target units. A sample has ``sample`` pairs, if there are as many. The best sample is refined on its
+    inliers until they no longer change. Stops early when a better sample is less likely than 1 - CONFIDENCE. Raises
+    DataError if there are fewer than three pairs, all are on one line, or no three agree.
     """
     check_shapes({"source": (source, "P 3"), "target": (target, "P 3")})
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)

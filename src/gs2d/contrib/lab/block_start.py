@@ -60,16 +60,9 @@ def load_start(
 ) -> dict[str, Any]:
     """Return the initial state of a block, as fields of ``TrainedPart``.
 
-    Parameters
-    ----------
-    splats_file : Path
-        The splats that were trained before.
-    start_file : Path
-        Written by :func:`write_start` for these splats.
-    recipe : Recipe
-        Of the block.
-    region : three tuples, or ()
-        Axes of the block, lower and upper limits along them, world units; a dense start is limited to it.
+    ``start_file`` was written by :func:`write_start` for the splats in ``splats_file``, which were trained before.
+    ``region`` has the axes of the block, lower and upper limits along them (world units), or is (); a dense start is
+    limited to it.
     """
     splats = splats_as_start(read_splats(splats_file), sh_degree=recipe.sh_degree)
     rows, saved = read_start(start_file)

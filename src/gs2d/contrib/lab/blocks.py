@@ -53,21 +53,11 @@ RETRIES = 2  # of killed tasks, which may have lacked memory
 # -- tasks -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class BlocksTask(Task):
-    """A task of a training in blocks.
+    """A task of a training in blocks."""
 
-    Attributes
-    ----------
-    options : TrainOptions
-        Options of one training of the whole scene; recipe and protocol are in ``blocks.json``.
-    step : callable
-        The function below that does the work, or continues it.
-    block : str
-        Name of the block, for tasks of one block.
-    """
-
-    options: TrainOptions
-    step: Callable[[BlocksTask, OnEvent], dict[str, Any]]
-    block: str = ""
+    options: TrainOptions  # of one training of the whole scene; recipe and protocol are in ``blocks.json``
+    step: Callable[[BlocksTask, OnEvent], dict[str, Any]]  # does the work, or continues it
+    block: str = ""  # its name, for tasks of one block
 
     def work(self, on_event: OnEvent) -> dict[str, Any]:
         """Run the step; return entries of the record."""
@@ -231,12 +221,8 @@ def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) 
 def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     """Train a capture in blocks; the folder is the run of the merged scene.
 
-    After an interruption the same call continues, and the result is byte-identical.
-
-    Raises
-    ------
-    Gs2dError
-        If the user has to act; finished tasks are kept.
+    After an interruption the same call continues, and the result is byte-identical; so do finished tasks after an
+    error.
     """
     partition = make_partition(options.blocks, options.partition_changes)
     if options.slots is not None and options.slots < 1:
@@ -316,13 +302,7 @@ def check_folder(out: Path) -> None:
 
 
 def settled_of(out: Path) -> dict[str, Any]:
-    """Return the content of ``blocks.json``.
-
-    Raises
-    ------
-    DataError, RunError
-        If the file is missing or damaged.
-    """
+    """Return the content of ``blocks.json``, or raise DataError or RunError."""
     data = read_json(out / BLOCKS_JSON)
     if isinstance(data, dict) and data.keys() >= {"recipe", "protocol", "partition"}:
         return data

@@ -16,28 +16,14 @@ _DIGITS = 12  # to which weights are rounded, as their last bits depend on the m
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Boxes in a rotated frame that tile space.
+    """Boxes in a rotated frame that tile space."""
 
-    Attributes
-    ----------
-    axes : ndarray [A, 3]
-        Orthonormal axes of the grid; A is 2 or 3.
-    low, high : ndarray [B, A], world units along the axes
-        A point is in a cell if ``low <= axes @ point < high``; infinite at the outside.
-    margin : float, world units
-        Distance by which a block trains beyond its cell.
-    side : float, world units
-        Mean side of a cell, without the outermost 1 % of the weight.
-    names : tuple of str
-        Names of the blocks: grid indices, ``1-3``.
-    """
-
-    axes: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    margin: float
-    side: float
-    names: tuple[str, ...]
+    axes: np.ndarray  # [A, 3] orthonormal axes of the grid; A is 2 or 3
+    low: np.ndarray  # [B, A], world units along the axes: a point is in a cell if ``low <= axes @ point < high``
+    high: np.ndarray  # [B, A]; infinite at the outside
+    margin: float  # distance by which a block trains beyond its cell, world units
+    side: float  # mean side of a cell, without the outermost 1 % of the weight, world units
+    names: tuple[str, ...]  # of the blocks: grid indices, ``1-3``
 
     def __len__(self) -> int:
         return len(self.names)
@@ -104,18 +90,10 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Spread of cameras and sparse points.
+    """Spread of cameras and sparse points."""
 
-    Attributes
-    ----------
-    axes : ndarray [3, 3]
-        Orthonormal axes by decreasing spread; the largest component of each is positive.
-    sides : ndarray [3], world units
-        Standard deviation along each.
-    """
-
-    axes: np.ndarray
-    sides: np.ndarray
+    axes: np.ndarray  # [3, 3] orthonormal, by decreasing spread; the largest component of each is positive
+    sides: np.ndarray  # [3] standard deviation along each, world units
 
 
 def spread_of(centers: np.ndarray, points: np.ndarray | None) -> Spread:
@@ -139,16 +117,8 @@ def spread_of(centers: np.ndarray, points: np.ndarray | None) -> Spread:
 def cut(places: np.ndarray, weights: np.ndarray, axes: np.ndarray, grid: Sequence[int], margin: float) -> Cells:
     """Return cells of equal weight: slabs along the first axis, each cut along the next.
 
-    Parameters
-    ----------
-    places : ndarray [N, 3], world units
-    weights : ndarray [N]
-        Weights; points of weight 0 are ignored.
-    axes : ndarray [A, 3]
-        One axis for each number of the grid.
-    grid : A numbers
-    margin : float
-        Fraction of the mean side of a cell.
+    ``places`` [N, 3] of weight 0 [N] are ignored. ``axes`` [A, 3] has one axis for each of the A numbers of ``grid``;
+    ``margin`` is a fraction of the mean side of a cell.
     """
     seen = weights > 0
     along, weights = places[seen].astype(np.float64) @ axes.T, np.round(weights[seen] / weights.max(), _DIGITS)

@@ -68,13 +68,7 @@ def check_address(address: str) -> None:
 
 
 def check_cluster(address: str) -> None:
-    """Connect to a cluster in another process, with a time limit.
-
-    Raises
-    ------
-    BackendError
-        If no Ray answers, or another version of Ray.
-    """
+    """Connect to a cluster in another process, in limited time; BackendError if no Ray answers, or another version."""
     try:
         probe = subprocess.run(
             [sys.executable, "-c", PROBE, address], capture_output=True, text=True, timeout=CONNECT_SECONDS
@@ -118,21 +112,11 @@ def connect(address: str) -> tuple[Any, bool]:
 # -- resources ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Shares:
-    """Resources of a task.
+    """Resources of a task."""
 
-    Attributes
-    ----------
-    cores : int
-        CPU threads of a task.
-    alone : int
-        CPU threads of a task that runs alone.
-    gpus : int
-        0 or 1.
-    """
-
-    cores: int
-    alone: int
-    gpus: int
+    cores: int  # CPU threads of a task
+    alone: int  # CPU threads of a task that runs alone
+    gpus: int  # 0 or 1
 
     def of(self, task: Task) -> dict[str, Any]:
         """Return the resources of a task by Ray's names."""
@@ -146,10 +130,7 @@ def shares(
 ) -> Shares:
     """Return the resources of tasks on machines with these resources (``CPU``, ``GPU``, ``memory``).
 
-    Raises
-    ------
-    BackendError
-        If no machine has a CPU, or a GPU that the backend needs.
+    Raises BackendError if no machine has a CPU, or a GPU that the backend needs.
     """
     gpus = int(backend == "cuda" or (backend == "auto" and any(node.get("GPU", 0) >= 1 for node in nodes)))
     able = [node for node in nodes if node.get("CPU", 0) >= 1 and node.get("GPU", 0) >= gpus]
@@ -191,13 +172,7 @@ def check_room(nodes: Sequence[Mapping[str, float]], taken: Mapping[str, Any], n
 def cluster_executor(
     address: str, folder: Path, tasks: Sequence[Task], *, slots: int | None, threads: int | None, backend: str
 ) -> OnCluster[Any]:
-    """Return an executor on a cluster.
-
-    Raises
-    ------
-    BackendError
-        If the cluster cannot be used, or a task fits on no machine.
-    """
+    """Return an executor on a cluster; BackendError if the cluster cannot be used, or a task fits on no machine."""
     ray, owned = connect(address)
     try:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -260,13 +235,7 @@ class OnCluster(Executor[AnyTask]):
         self._running[remote.remote(order, self._queue)] = task
 
     def wait(self, on_event: OnEvent) -> list[tuple[AnyTask, bool]]:
-        """Wait for a task to end, and pass on events of all tasks.
-
-        Raises
-        ------
-        BackendError
-            If a machine cannot run any task.
-        """
+        """Wait for a task to end, and pass on events of all tasks; BackendError if a machine cannot run any task."""
         refs = list(self._running)
         self._ray.wait(refs, num_returns=1, timeout=POLL_SECONDS)
         ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)

@@ -12,18 +12,9 @@ from typing import Any
 def do_on_worker(order: dict[str, Any], queue: Any) -> dict[str, Any]:
     """Run a task in this process of a cluster.
 
-    Parameters
-    ----------
-    order : dict
-        ``name``; ``task``, pickled; ``version`` of the driver; ``folder``, ``token`` of the
-        output; ``cwd``, the base of relative paths.
-    queue : ray.util.queue.Queue
-        Takes (name, event).
-
-    Returns
-    -------
-    dict
-        ``state`` of the record of the task, with its ``reason``; or "refused" with a reason if no task can run here.
+    ``order`` has ``name``; ``task``, pickled; ``version`` of the driver; ``folder``, ``token`` of the output; ``cwd``,
+    the base of relative paths. ``queue`` (ray.util.queue.Queue) takes (name, event). Returns the ``state`` of the
+    task's record, with its ``reason``; or "refused" with a reason if no task can run here.
     """
     import contextlib
     import os

@@ -37,19 +37,11 @@ CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz")  # DTU
 
 @dataclass(frozen=True)
 class MissingPiece:
-    """A missing file of a scene.
-
-    Attributes
-    ----------
-    purpose : str
-        Use of the file, such as "for training".
-    source : str
-        How to get the file, as a clause.
-    """
+    """A missing file of a scene."""
 
     path: Path
-    purpose: str
-    source: str
+    purpose: str  # use of the file, such as "for training"
+    source: str  # how to get the file, as a clause
 
     def line(self) -> str:
         """Return path, purpose and source in one line."""
@@ -165,12 +157,8 @@ def recognise(root: Path, truth: Path | None = None) -> tuple[DataSet, SceneFact
     """Return the data set and scene of a capture, by the name of its folder and its files; None for other captures.
 
     COLMAP captures need more than a name, as many are called garden or truck: Tanks and Temples the camera log beside
-    the images or an official file, Mip-NeRF 360 its ``poses_bounds.npy``.
-
-    Parameters
-    ----------
-    truth : Path, optional
-        Folder of official files; None: beside the capture.
+    the images or an official file, Mip-NeRF 360 its ``poses_bounds.npy``. ``truth`` is the folder of official files;
+    None: beside the capture.
     """
     root = Path(os.path.abspath(root))  # "." has no name; a link keeps its own
     for dataset in DATASETS.values():
@@ -216,10 +204,7 @@ def find_truth(
 ) -> tuple[dict[str, Path], tuple[MissingPiece, ...]]:
     """Return the files of a scene's ground truth, and the missing ones.
 
-    Parameters
-    ----------
-    folder : Path, optional
-        Folder of the ground truth; None: the capture, the folders above it, and their subfolders.
+    They are searched in ``folder``; None: in the capture, the folders above it, and their subfolders.
     """
     above = 2 if dataset.name == "dtu" else 3  # TNT_GOF/TrainingSet/Barn is deeper than DTU/scan24
     places = [folder] if folder is not None else [root, *root.parents[:above]]

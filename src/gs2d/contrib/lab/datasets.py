@@ -16,48 +16,24 @@ from gs2d.errors import ProtocolError
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """One scene of a data set.
+    """One scene of a data set."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the folder in the data set.
-    protocol : str
-        Name of the protocol.
-    downscale : int
-        Factor by which images are shrunk.
-    images : str
-        Folder of the images.
-    tau : float or None
-        m, Tanks and Temples: threshold of precision and recall.
-    scan : int or None
-        DTU: the number of the scan.
-    """
-
-    name: str
+    name: str  # of the folder in the data set
     protocol: str
-    downscale: int
-    images: str = "images"
-    tau: float | None = None
-    scan: int | None = None
+    downscale: int  # factor by which images are shrunk
+    images: str = "images"  # folder of the images
+    tau: float | None = None  # m, Tanks and Temples: threshold of precision and recall
+    scan: int | None = None  # DTU: the number of the scan
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """A data set of the paper.
-
-    Attributes
-    ----------
-    scenes : tuple of SceneFacts
-        In the order of the paper's tables.
-    evaluator : str
-        Of surfaces: "dtu", "tnt", "visible-surface", or "" without ground truth.
-    """
+    """A data set of the paper."""
 
     name: str
     title: str
-    scenes: tuple[SceneFacts, ...]
-    evaluator: str
+    scenes: tuple[SceneFacts, ...]  # in the order of the paper's tables
+    evaluator: str  # of surfaces: "dtu", "tnt", "visible-surface", or "" without ground truth
 
     def scene(self, name: str) -> SceneFacts:
         """Return the scene of a name, ignoring case, or raise ProtocolError."""

@@ -44,12 +44,8 @@ def read_dtu(root: Path) -> Capture:
     background is trained. All views train.
 
     If the cameras of ``sparse/0`` have the same centres, its points are used, and its intrinsics if they match the
-    image size: 2DGS undistorted its images to another size.
-
-    Raises
-    ------
-    DataError
-        If a file is missing or invalid, the numbers of images and cameras differ, or a matrix is not a camera.
+    image size: 2DGS undistorted its images to another size. Raises DataError if a file is missing or invalid, the
+    numbers of images and cameras differ, or a matrix is not a camera.
     """
     model = _read_model(root)
     path, world, scale = _matrices_of(root, model)
@@ -122,12 +118,8 @@ def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:
 def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float, float, np.ndarray]:
     """Decompose a projection matrix [3 or 4, 4] of any scale: fx, fy, cx, cy and T_cam_world [4, 4].
 
-    P[:, :3] = s K R by RQ decomposition with positive diagonal of K and det R = 1; t = K^-1 P[:, 3] / s.
-
-    Raises
-    ------
-    DataError
-        If it is not finite, singular, or has skew.
+    P[:, :3] = s K R by RQ decomposition with positive diagonal of K and det R = 1; t = K^-1 P[:, 3] / s. Raises
+    DataError if the matrix is not finite, singular, or has skew.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # scale by a power of two, without rounding
         P = np.ldexp(P, -int(np.frexp(np.abs(P[:3, :3]).max())[1]))

@@ -34,28 +34,14 @@ from gs2d.io.meshes import read_points
 # -- files -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class DtuTruth:
-    """Ground truth of one scan, in mm.
-
-    Attributes
-    ----------
-    points : ndarray [P, 3]
-        The structured-light scan (``stlNNN_total.ply``).
-    observed : ndarray [X, Y, Z] bool
-        Cells that the scanner observed (``ObsMaskN_10.mat``).
-    bounds : ndarray [2, 3]
-        Smallest and largest corner of those cells.
-    resolution : float
-        mm, side of a cell.
-    plane : ndarray [4]
-        Points with plane . (x, y, z, 1) > 0 are above the table (``PlaneN.mat``).
-    """
+    """Ground truth of one scan, in mm."""
 
     scan: int
-    points: np.ndarray
-    observed: np.ndarray
-    bounds: np.ndarray
-    resolution: float
-    plane: np.ndarray
+    points: np.ndarray  # [P, 3]: the structured-light scan (``stlNNN_total.ply``)
+    observed: np.ndarray  # [X, Y, Z] bool: cells that the scanner observed (``ObsMaskN_10.mat``)
+    bounds: np.ndarray  # [2, 3]: smallest and largest corner of those cells
+    resolution: float  # side of a cell, mm
+    plane: np.ndarray  # [4]: points with plane . (x, y, z, 1) > 0 are above the table (``PlaneN.mat``)
 
     def is_observed(self, points: np.ndarray) -> np.ndarray:
         """Return which points [P, 3] lie in an observed cell, bool [P] (nearest cell centre, ties to even)."""
@@ -70,13 +56,7 @@ class DtuTruth:
 
 
 def read_dtu_truth(scan: int, files: Mapping[str, Path]) -> DtuTruth:
-    """Read the ground truth of a scan from its three ``files`` (keys as ``dtu_truth_files``).
-
-    Raises
-    ------
-    DataError
-        If a file is missing or broken.
-    """
+    """Read the ground truth of a scan from its three ``files`` (keys as ``dtu_truth_files``), or raise DataError."""
     mask = _matrices(files["mask"], ("ObsMask", "BB", "Res"))
     observed, bounds = np.asarray(mask["ObsMask"]), np.asarray(mask["BB"], np.float64)
     if observed.ndim != 3 or bounds.shape != (2, 3) or np.asarray(mask["Res"]).size != 1:
@@ -137,34 +117,18 @@ class ViewSilhouette:
 
 @dataclass(frozen=True, eq=False)
 class DtuScore:
-    """The score of one scan, mm; None, with ``reason``, if nothing could be measured.
+    """The score of one scan, mm; None, with ``reason``, if nothing could be measured."""
 
-    Attributes
-    ----------
-    accuracy, completeness, chamfer : float or None
-        Mean distance from the reconstruction to the scan (d2s), from the scan to the reconstruction (s2d), their mean.
-    mesh_points, truth_points : int
-        Number of compared points.
-    dropped_mesh, dropped_truth : float
-        Fraction at ``max_distance`` or more.
-    culled : float
-        Fraction of the vertices outside a silhouette.
-    ok : bool
-        Self-check: whether reconstruction and scan coincide.
-    messages : tuple of str
-        Warnings, one line each.
-    """
-
-    accuracy: float | None
-    completeness: float | None
-    chamfer: float | None
-    mesh_points: int
+    accuracy: float | None  # mean distance from the reconstruction to the scan (d2s)
+    completeness: float | None  # from the scan to the reconstruction (s2d)
+    chamfer: float | None  # the mean of both
+    mesh_points: int  # number of compared points
     truth_points: int
-    dropped_mesh: float
+    dropped_mesh: float  # fraction at ``max_distance`` or more
     dropped_truth: float
-    culled: float
-    ok: bool
-    messages: tuple[str, ...]
+    culled: float  # fraction of the vertices outside a silhouette
+    ok: bool  # self-check: whether reconstruction and scan coincide
+    messages: tuple[str, ...]  # warnings, one line each
     clouds: ScoredClouds
     reason: str | None = None
 
@@ -177,14 +141,9 @@ def evaluate_dtu(
     *,
     protocol: DtuSurface = DTU_SURFACE,
 ) -> DtuScore:
-    """Score a mesh in the frame of the scene.
+    """Score a mesh in the frame of the scene; ``T_metric_scene`` [4, 4], the scale_mat, maps the scene to mm.
 
-    Parameters
-    ----------
-    silhouettes : sequence of ViewSilhouette
-        Silhouettes of all views; (): nothing is culled.
-    T_metric_scene : ndarray [4, 4]
-        scale_mat: from the scene to mm.
+    The mesh is culled by the ``silhouettes`` of all views; (): nothing is culled.
     """
     similarity_scale(T_metric_scene, "T_metric_scene")
     keep = inside_silhouettes(mesh.vertices.astype(np.float64), silhouettes, protocol)

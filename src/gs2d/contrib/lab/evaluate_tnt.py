@@ -47,22 +47,12 @@ _CHUNK = 1 << 21
 
 @dataclass(frozen=True, eq=False)
 class CropVolume:
-    """The scored volume, in the frame of the ground truth.
+    """The scored volume, in the frame of the ground truth."""
 
-    Attributes
-    ----------
-    axis : int
-        0, 1 or 2: the axis along which the polygon is extruded.
-    low, high : float
-        Range along it, both ends included.
-    polygon : ndarray [n, 2]
-        Corners in the two other axes, in ascending order of axis; even-odd rule.
-    """
-
-    axis: int
-    low: float
+    axis: int  # 0, 1 or 2: the axis along which the polygon is extruded
+    low: float  # range along it, both ends included
     high: float
-    polygon: np.ndarray
+    polygon: np.ndarray  # [n, 2]: corners in the two other axes, in ascending order of axis; even-odd rule
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return which points [P, 3] lie inside, bool [P]."""
@@ -118,35 +108,17 @@ def read_crop(path: Path) -> CropVolume:
 # -- files -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class TntTruth:
-    """Ground truth of one scene.
-
-    Attributes
-    ----------
-    points : ndarray [P, 3]
-        The laser scan, m.
-    crop : CropVolume
-        In the scan's frame.
-    T_truth_log : ndarray [4, 4]
-        ``SCENE_trans.txt``: from the frame of the log to that of the scan.
-    trajectory : ndarray [n, 4, 4]
-        ``SCENE_COLMAP_SfM.log``: camera-to-world matrices of all photographs, in order.
-    """
+    """Ground truth of one scene."""
 
     scene: str
-    points: np.ndarray
-    crop: CropVolume
-    T_truth_log: np.ndarray
-    trajectory: np.ndarray
+    points: np.ndarray  # [P, 3]: the laser scan, m
+    crop: CropVolume  # in the scan's frame
+    T_truth_log: np.ndarray  # [4, 4], ``SCENE_trans.txt``: from the frame of the log to that of the scan
+    trajectory: np.ndarray  # [n, 4, 4], ``SCENE_COLMAP_SfM.log``: camera-to-world matrices of all photographs, in order
 
 
 def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
-    """Read the ground truth of a scene from its four ``files`` (keys as ``tnt_truth_files``).
-
-    Raises
-    ------
-    DataError
-        If a file is missing or broken.
-    """
+    """Read the ground truth of a scene from its four ``files`` (keys as ``tnt_truth_files``), or raise DataError."""
     points = np.asarray(read_points(files["scan"]).points)
     crop = read_crop(files["crop"])
     if not crop.contains(points).any():
@@ -190,15 +162,10 @@ def _number_rows(path: Path) -> list[list[float]]:
 
 
 def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> tuple[np.ndarray, np.ndarray]:
-    """Match photographs with the ``count`` entries of a log; return both indices [m], [m].
+    """Match photographs with the ``count`` entries of a log; return both indices [m], [m], or raise DataError.
 
     Equal numbers are matched in natural order of names (``frame_2`` before ``frame_10``); else by the number in the
     name, starting at 1 (``000001.jpg``) as in Tanks and Temples, or at 0 if that number occurs.
-
-    Raises
-    ------
-    DataError
-        If neither is possible.
     """
     order = np.array(sorted(range(len(names)), key=lambda i: natural_key(names[i])), np.int64)
     if len(names) == count:
@@ -221,74 +188,40 @@ def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> t
 # -- the score ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The self-check.
+    """The self-check."""
 
-    Attributes
-    ----------
-    ok : bool
-        Whether the alignment passed.
-    messages : tuple of str
-        Warnings, one line each.
-    cameras : int
-        Number of cameras matched with the log.
-    camera_fraction : float
-        Fraction of these within the threshold of the protocol.
-    camera_rms, camera_worst : float
-        m, of these.
-    scale : float
-        Final scale from capture to scan.
-    shift : float or None
-        rms distance by which the stages moved the mesh, tau.
-    shift_scale, shift_degrees : float
-        Change of scale and rotation by the stages.
-    transform_alone : float or None
-        tau. rms error of the mesh with ``_trans.txt`` alone.
-    stages : tuple of dict
-        Of each stage: ``voxel`` and ``threshold`` (m), ``points``, and the numbers of ``IcpResult``.
-    T_truth_mesh : ndarray [4, 4]
-    """
-
-    ok: bool
-    messages: tuple[str, ...]
-    cameras: int
-    camera_fraction: float
-    camera_rms: float
-    camera_worst: float
-    scale: float
-    shift: float | None
-    shift_scale: float
-    shift_degrees: float
-    transform_alone: float | None
+    ok: bool  # whether the alignment passed
+    messages: tuple[str, ...]  # warnings, one line each
+    cameras: int  # number of cameras matched with the log
+    camera_fraction: float  # fraction of these within the threshold of the protocol
+    camera_rms: float  # of these, m
+    camera_worst: float  # of these, m
+    scale: float  # final scale from capture to scan
+    shift: float | None  # rms distance by which the stages moved the mesh, tau
+    shift_scale: float  # change of scale by the stages
+    shift_degrees: float  # rotation by the stages
+    transform_alone: float | None  # rms error of the mesh with ``_trans.txt`` alone, tau
+    # of each: ``voxel`` and ``threshold`` (m), ``points``, and the numbers of ``IcpResult``
     stages: tuple[dict[str, Any], ...]
-    T_truth_mesh: np.ndarray
+    T_truth_mesh: np.ndarray  # [4, 4]
 
 
 @dataclass(frozen=True, eq=False)
 class TntScore:
-    """The score of one scene, in m; None, with ``reason``, if nothing could be measured.
-
-    Attributes
-    ----------
-    precision, recall, f_score : float or None
-    accuracy, completeness, chamfer : float or None
-        Mean distance from the reconstruction to the scan, back, and the mean of the two (not part of the protocol).
-    mesh_points, truth_points : int
-        Number of scored points.
-    clouds : ScoredClouds
-        The scored points with their distances.
-    """
+    """The score of one scene, in m; None, with ``reason``, if nothing could be measured."""
 
     tau: float
     precision: float | None
     recall: float | None
     f_score: float
+    # mean distance from the reconstruction to the scan; these three are not part of the protocol
     accuracy: float | None
-    completeness: float | None
-    chamfer: float | None
-    mesh_points: int
+    completeness: float | None  # from the scan to the reconstruction
+    chamfer: float | None  # mean of the two
+    mesh_points: int  # number of scored points
     truth_points: int
     alignment: Alignment
-    clouds: ScoredClouds
+    clouds: ScoredClouds  # the scored points with their distances
     reason: str | None = None
 
 
@@ -302,25 +235,11 @@ def evaluate_tnt(
     published: np.ndarray | None = None,
     protocol: TntSurface = TNT_SURFACE,
 ) -> TntScore:
-    """Score a mesh.
+    """Score a mesh in the capture's frame, with threshold ``tau`` (m).
 
-    Parameters
-    ----------
-    mesh : Mesh
-        In the capture's frame.
-    names : sequence of str
-        Names of all photographs of the capture.
-    centers : ndarray [n, 3]
-        Their camera centres, in the capture's frame.
-    tau : float
-        m.
-    published : ndarray [m, 4, 4], optional
-        The log beside the photographs, which is only compared with the cameras.
-
-    Raises
-    ------
-    DataError
-        If the cameras do not match the log.
+    ``names`` and ``centers`` [n, 3] are those of all photographs of the capture, in its frame. ``published`` [m, 4, 4]
+    is the log beside the photographs, which is only compared with the cameras. Raises DataError if the cameras do not
+    match the log.
     """
     source = point_set(mesh)
     fit, frame_notes = _camera_fit(names, centers, truth, published, protocol)

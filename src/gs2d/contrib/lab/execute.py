@@ -27,22 +27,14 @@ POLL_SECONDS = 0.5
 
 @dataclass(frozen=True)
 class Workers:
-    """Where and with which resources tasks run; the fields are options of `gs2d sweep` and `blocks`.
+    """Where and with which resources tasks run; the fields are options of `gs2d sweep` and `blocks`."""
 
-    Attributes
-    ----------
-    slots : int or None
-        Number of parallel tasks; None: one per GPU if the backend is CUDA, else one, in this process; on a cluster, as
-        many as fit.
-    threads : int or None
-        CPU threads of each parallel task; None: the cores divided by the number of tasks.
-    cluster : str or None
-        Address of a Ray cluster, ``HOST:PORT`` or ``auto`` for the cluster of this machine; None: this machine.
-    """
-
+    # Number of parallel tasks; None: one per GPU if the backend is CUDA, else one, in this process; on a cluster, as
+    # many as fit.
     slots: int | None = None
-    threads: int | None = None
+    threads: int | None = None  # CPU threads of each parallel task; None: the cores divided by the number of tasks
     backend: str = "auto"
+    # Address of a Ray cluster, ``HOST:PORT`` or ``auto`` for the cluster of this machine; None: this machine.
     cluster: str | None = None
 
 
@@ -55,27 +47,12 @@ def execute(
     before: Callable[[], None] = lambda: None,
     after_task: Callable[[AnyTask], object] = lambda _task: None,
 ) -> None:
-    """Run all unfinished tasks; a failure is recorded, and the other tasks continue.
+    """Run all unfinished tasks, each after those that it needs; a failure is recorded, and the other tasks continue.
 
-    Parameters
-    ----------
-    tasks : sequence of Task
-        Each after the tasks that it needs.
-    folder : Path
-        Output folder of the tasks, locked while they run. The operating system releases the lock of a killed process.
-    on_event : callable
-        Receives the events of a single task, or the progress of several tasks.
-    before : callable
-        Called when the folder is locked.
-    after_task : callable
-        Called after each task.
-
-    Raises
-    ------
-    BackendError
-        If the number of slots is invalid, or the cluster cannot be used.
-    RunError
-        If another process works in the folder.
+    ``folder``, the output folder of the tasks, is locked while they run; the operating system releases the lock of a
+    killed process. ``on_event`` receives the events of a single task, or the progress of several tasks. ``before`` is
+    called when the folder is locked. Raises BackendError if the number of slots is invalid, or the cluster cannot be
+    used, and RunError if another process works in the folder.
     """
     slots, cluster = workers.slots, workers.cluster
     if slots is not None and slots < 1:

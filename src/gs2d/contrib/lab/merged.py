@@ -36,13 +36,7 @@ STAGE = "blocks"  # the stage of a merged run in metrics.json
 
 
 def merged_splats(out: Path) -> Splats:
-    """Return the splats of all blocks, each cropped to its cell.
-
-    Raises
-    ------
-    RunError
-        If a block is not finished.
-    """
+    """Return the splats of all blocks, each cropped to its cell, or raise RunError if a block is not finished."""
     split = read_split(partition_folder(out))
     coarse = finished_splats(open_run(coarse_folder(out)))
     trained = [block.name for block in split.blocks if not block.skipped]
@@ -54,10 +48,7 @@ def merged_splats(out: Path) -> Splats:
 def write_merged(settled: LoadedRun, options: TrainOptions, partition: Partition, on_event: OnEvent) -> dict[str, Any]:
     """Write the merged splats and the start of the seams: ``MERGED``, ``seams.npz``, ``seams.json``.
 
-    Returns
-    -------
-    dict
-        Number of ``splats``, and of ``views`` that show a seam.
+    Returns the number of ``splats``, and of ``views`` that show a seam.
     """
     out, splats, views = options.out, merged_splats(options.out), tuple[str, ...]()
     if partition.seam > 0 and partition.seam_schedule > 0:
@@ -77,13 +68,7 @@ def write_merged(settled: LoadedRun, options: TrainOptions, partition: Partition
 
 
 def read_seam_views(out: Path) -> tuple[str, ...]:
-    """Return the views that show the seams of the merged scene.
-
-    Raises
-    ------
-    DataError, RunError
-        If the file is missing or damaged.
-    """
+    """Return the views that show the seams of the merged scene, or raise DataError or RunError."""
     found = read_json(out / SEAM_VIEWS)
     views = found.get("views") if isinstance(found, dict) else None
     if not isinstance(views, list) or not all(isinstance(view, str) for view in views):

@@ -12,18 +12,7 @@ from gs2d.errors import DataError
 
 
 class Cloud:
-    """A point cloud for nearest-neighbour queries.
-
-    Parameters
-    ----------
-    points : ndarray [P, 3]
-        Stored as float64 in ``points``; may be empty.
-
-    Raises
-    ------
-    DataError
-        If a coordinate is not finite.
-    """
+    """Points [P, 3] for nearest-neighbour queries, as float64; may be empty. A DataError if they are not finite."""
 
     def __init__(self, points: np.ndarray) -> None:
         self.points = _checked(points, "points")
@@ -32,27 +21,10 @@ class Cloud:
     def nearest(
         self, queries: np.ndarray, *, neighbours: int = 1, limit: float = math.inf
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Find the nearest points of the cloud.
+        """Find the K = ``neighbours`` nearest points of finite ``queries`` [Q, 3] that are nearer than ``limit``.
 
-        Parameters
-        ----------
-        queries : ndarray [Q, 3]
-        neighbours : int
-            K.
-        limit : float
-            Upper bound of the distances.
-
-        Returns
-        -------
-        distances : ndarray [Q, K] float64
-            Ascending; infinite for missing neighbours.
-        index : ndarray [Q, K] int64
-            Rows of ``points``; P for missing neighbours.
-
-        Raises
-        ------
-        DataError
-            If a coordinate is not finite.
+        Returns ascending distances [Q, K] float64, infinite for missing neighbours, and rows of ``points`` [Q, K]
+        int64, P for missing neighbours.
         """
         k = range(1, neighbours + 1)  # a list gives one column per neighbour, even for one
         queries = _checked(queries, "queries")

@@ -32,35 +32,20 @@ FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrid
 
 @dataclass(frozen=True)
 class PaperResult:
-    """The result of ``gs2d sweep``.
-
-    Attributes
-    ----------
-    files : tuple of Path
-        table.json first.
-    failures : dict
-        Reasons of failed runs by name.
-    unfinished : int
-        Number of runs that are not trained (``--no-train``).
-    """
+    """The result of ``gs2d sweep``."""
 
     table: PaperTable
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # table.json first
     results: Results
     checked: tuple[ClaimResult, ...]
-    failures: dict[str, str]
-    unfinished: int
+    failures: dict[str, str]  # reasons of failed runs by name
+    unfinished: int  # number of runs that are not trained (``--no-train``)
 
 
 def paper(options: SweepOptions, on_event: OnEvent = ignore) -> PaperResult:
     """Train the missing runs of a table, and write the table.
 
     Cells of a failed run are empty, with the reason; other runs continue.
-
-    Raises
-    ------
-    Gs2dError
-        If options or data are invalid, or another process works in the folder.
     """
     asked = make_plan(options)
     check_folder(asked)

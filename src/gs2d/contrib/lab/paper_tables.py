@@ -28,25 +28,13 @@ LOWER_IS_BETTER = frozenset({"chamfer", "lpips", "bytes", "seconds"})
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of the paper on a table that can be checked.
+    """A statement of the paper on a table that can be checked."""
 
-    Attributes
-    ----------
-    text : str
-        The claim in words.
-    metric : str
-        A key of METRICS, or "surface": F-score or Chamfer distance, by data set.
-    rows : tuple of str
-        Labels: from worst to best ("ascending"), the best last ("best"), or all alike ("flat").
-    within : float or None
-        For "flat": largest difference of two rows, slightly above that of the paper.
-    """
-
-    text: str
-    metric: str
-    rows: tuple[str, ...]
+    text: str  # the claim in words
+    metric: str  # a key of METRICS, or "surface": F-score or Chamfer distance, by data set
+    rows: tuple[str, ...]  # labels: from worst to best ("ascending"), the best last ("best"), or all alike ("flat")
     kind: str = "ascending"
-    within: float | None = None
+    within: float | None = None  # for "flat": largest difference of two rows, slightly above that of the paper
 
 
 @dataclass(frozen=True)
@@ -87,13 +75,7 @@ class PaperTable:
 
 
 def recipe_table(recipes: Sequence[str]) -> PaperTable:
-    """Return a table with one row per recipe, named by its short name.
-
-    Raises
-    ------
-    RecipeError
-        If two recipes have the same short name.
-    """
+    """Return a table with one row per recipe, named by its short name; RecipeError if two have the same."""
     names = list(dict.fromkeys(recipes))
     shown = [short_name(name) for name in names]
     for first, second in itertools.combinations(range(len(names)), 2):

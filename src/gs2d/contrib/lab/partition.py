@@ -26,71 +26,44 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class CoarseModel:
-    """The coarse model of the whole scene, which is frozen around each block.
+    """The coarse model of the whole scene, which is frozen around each block."""
 
-    Attributes
-    ----------
-    side : int, px
-        Photographs are shrunk by an integer factor to about this longer side. Position matters here, not detail.
-    max_splats : int
-        Limit on splats. Each block renders those that its photographs show.
-    schedule : float
-        Fraction of the recipe's iterations. Surfaces are in place after a third.
-    """
-
+    # px. Photographs are shrunk by an integer factor to about this longer side. Position matters here, not detail.
     side: int = 400
-    max_splats: int = 1_000_000
-    schedule: float = 0.3
+    max_splats: int = 1_000_000  # limit; each block renders those that its photographs show
+    schedule: float = 0.3  # fraction of the recipe's iterations; surfaces are in place after a third
 
 
 @dataclass(frozen=True)
 class Partition:
-    """Cells, views and start of blocks.
+    """Cells, views and start of blocks."""
 
-    Attributes
-    ----------
-    grid : tuple of int
-        Number of blocks along the axes of the largest spread of cameras and sparse points, two (on the ground) or
-        three. ``()``: as many as memory needs.
-    margin : float
-        Fraction of the mean cell side by which a block trains beyond its cell, so that surfaces at a seam are trained
-        with their surroundings. Multiplies the trained splats by (1 + 2 margin)^2.
-    min_share : float
-        A photograph belongs to a block if at least this fraction of its blending weight in the coarse model is in the
-        block with its margin.
-    min_views : int
-        Minimum number of photographs of a block; the ones that show most of it are added.
-    splats : int
-        Limit on trained splats of a block with its margin, which determines the number of blocks of an open grid.
-    photographs : int
-        Approximate number of photographs of a block of an open grid.
-    flat : float
-        An open grid is cut along a third axis if its spread exceeds this fraction of the second axis: land and streets
-        are cut on the ground, halls and towers in space.
-    seam : float
-        After the merge, splats within this fraction of the mean cell side from a seam are trained once more, with all
-        others frozen, because the blocks on both sides were never rendered together.
-    seam_schedule : float
-        Iterations per photograph of that training, as a fraction of those of a block; 0 disables it.
-    start : "dense" or "coarse"
-        Start of a block: the recipe's dense start from the photographs of the block, if the recipe has one, or the
-        splats of the coarse model, which lack the detail of large photographs.
-    extent : "scene" or "block"
-        Unit of sizes and steps in a block: the extent of all cameras, or of those of the block.
-    """
-
+    # Number of blocks along the axes of the largest spread of cameras and sparse points, two (on the ground) or three.
+    # ``()``: as many as memory needs.
     grid: tuple[int, ...] = ()
     coarse: CoarseModel = field(default_factory=CoarseModel)
+    # Fraction of the mean cell side by which a block trains beyond its cell, so that surfaces at a seam are trained
+    # with their surroundings. Multiplies the trained splats by (1 + 2 margin)^2.
     margin: float = 0.2
+    # A photograph belongs to a block if at least this fraction of its blending weight in the coarse model is in the
+    # block with its margin.
     min_share: float = 0.1
-    min_views: int = 20
+    min_views: int = 20  # minimum number of photographs of a block; the ones that show most of it are added
+    # limit on trained splats of a block with its margin; gives the number of blocks of an open grid
     splats: int = 3_000_000
-    photographs: int = 600
+    photographs: int = 600  # approximate number of photographs of a block of an open grid
+    # An open grid is cut along a third axis if its spread exceeds this fraction of the second axis: land and streets
+    # are cut on the ground, halls and towers in space.
     flat: float = 0.5
+    # After the merge, splats within this fraction of the mean cell side from a seam are trained once more, with all
+    # others frozen, because the blocks on both sides were never rendered together.
     seam: float = 0.05
+    # iterations per photograph of that training, as a fraction of those of a block; 0 disables it
     seam_schedule: float = 0.2
+    # Start of a block. "dense": the recipe's dense start from the photographs of the block, if the recipe has one;
+    # "coarse": the splats of the coarse model, which lack the detail of large photographs.
     start: str = "dense"
-    extent: str = "scene"
+    extent: str = "scene"  # unit of sizes and steps in a block: extent of all cameras ("scene") or of its own ("block")
 
     @property
     def blocks(self) -> int:
@@ -175,12 +148,8 @@ def from_json(data: Any) -> Partition:
 def grid_for(blocks: int, spread: Sequence[float], flat: float) -> tuple[int, ...]:
     """Return a grid of at least ``blocks`` blocks with cells of about equal sides.
 
-    Parameters
-    ----------
-    spread : three floats
-        Of cameras and points along the axes, largest first.
-    flat : float
-        As of :class:`Partition`.
+    ``spread`` has three numbers, of cameras and points along the axes, largest first; ``flat`` as of
+    :class:`Partition`.
     """
     sides = [max(value, 1e-12) for value in spread]
     axes = 3 if sides[2] > flat * sides[1] else 2

@@ -76,21 +76,13 @@ class ShownRow:
 
 @dataclass(frozen=True)
 class TablePart:
-    """The part of a table for one data set.
-
-    Attributes
-    ----------
-    columns : tuple of str
-        Metrics.
-    scenes : list of str
-        Scenes in the means.
-    """
+    """The part of a table for one data set."""
 
     data_set: str
     trained: bool
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # metrics
     rows: tuple[ShownRow, ...]
-    scenes: list[str]
+    scenes: list[str]  # scenes in the means
 
     @property
     def heads(self) -> list[str]:

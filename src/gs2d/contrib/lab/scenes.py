@@ -27,59 +27,29 @@ OFFICIAL = ("dtu", "tnt")  # evaluators that need several files
 
 @dataclass(frozen=True)
 class FoundScene:
-    """A capture.
+    """A capture."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the folder.
-    downscale : int
-        Factor by which the protocol shrinks images.
-    data_set : str
-        Name in the paper; "other (PROTOCOL)" for captures that belong to no known data set.
-    scene : str
-        Name in the data set, else of the folder.
-    truth : Path or None
-        Ground truth for the evaluation; None: none, or one that the evaluation finds.
-    scored : bool
-        Whether there is a ground truth.
-    missing : tuple of str
-        One line for each missing file of the capture or its ground truth, for known data sets.
-    """
-
-    name: str
+    name: str  # of the folder
     path: Path
     format: str
     protocol: Protocol
-    downscale: int
-    data_set: str
-    scene: str
-    truth: Path | None
-    scored: bool
-    missing: tuple[str, ...]
+    downscale: int  # factor by which the protocol shrinks images
+    data_set: str  # name in the paper; "other (PROTOCOL)" for captures that belong to no known data set
+    scene: str  # name in the data set, else of the folder
+    truth: Path | None  # for the evaluation; None: none, or one that the evaluation finds
+    scored: bool  # whether there is a ground truth
+    missing: tuple[str, ...]  # one line for each missing file of the capture or its ground truth, for known data sets
 
 
 def find_scenes(
     data: Path, names: Sequence[str] = (), *, protocol: str = "auto", truths: Path | None = None
 ) -> tuple[FoundScene, ...]:
-    """Return the captures at or under a folder, sorted by name.
+    """Return the captures at or under a folder (up to ``DEPTH`` levels down), sorted by name.
 
-    Parameters
-    ----------
-    data : Path
-        A capture, or a folder that holds captures (up to ``DEPTH`` levels down).
-    names : sequence of str
-        Only these; "lego" also finds a folder "nerf_synthetic_lego".
-    protocol : str
-        Name, or "auto": by data set and format of each capture.
-    truths : Path, optional
-        Folder of ground truths: ``NAME.ply``, ``NAME.obj``, ``NAME/mesh_gt.ply``, or the official files of DTU and
-        Tanks and Temples.
-
-    Raises
-    ------
-    DataError, ProtocolError
-        If there are no captures, or a name is unknown.
+    Only ``names``, if there are any; "lego" also finds a folder "nerf_synthetic_lego". ``protocol`` is a name, or
+    "auto": by data set and format of each capture. ``truths`` is a folder of ground truths: ``NAME.ply``, ``NAME.obj``,
+    ``NAME/mesh_gt.ply``, or the official files of DTU and Tanks and Temples. Raises DataError or ProtocolError if there
+    are no captures, or a name is unknown.
     """
     named = None if protocol == "auto" else get_protocol(protocol)
     if not data.is_dir():

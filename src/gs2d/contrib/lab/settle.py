@@ -73,13 +73,7 @@ def settle(options: TrainOptions, on_event: OnEvent, recipe: Recipe | None = Non
 
 
 def capture_digest(scene: Scene) -> str:
-    """Return a hash of cameras, points, and names, sizes and times of photographs.
-
-    Raises
-    ------
-    DataError
-        If a photograph is missing.
-    """
+    """Return a hash of cameras, points, and names, sizes and times of photographs; a missing one is a DataError."""
     digest = hashlib.sha256()
     for split, views in (("train", scene.train), ("test", scene.test)):
         for view in views:

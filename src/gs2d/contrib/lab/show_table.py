@@ -21,13 +21,7 @@ def show_blocks(command: BlocksCommand, console: Console) -> None:
 
 
 def show_table(command: SweepCommand, console: Console) -> None:
-    """Run ``gs2d sweep``.
-
-    Raises
-    ------
-    RunError
-        At the end, if runs failed.
-    """
+    """Run ``gs2d sweep``; RunError at the end, if runs failed."""
     result = run_paper(command, console.on_event)
     _tables(result, console)
     if command.json:

@@ -31,35 +31,17 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class BlockOfSplit:
-    """A block of the scene.
+    """A block of the scene."""
 
-    Attributes
-    ----------
-    name : str
-        Grid indices, ``1-3``.
-    views : tuple of str
-        Training photographs, in the order of the scene; () if the block is not trained.
-    floor : int
-        Number of photographs that were added to reach ``Partition.min_views``.
-    own, frozen, core : int
-        Number of coarse splats that are trained, that are frozen, and that lie in the cell.
-    weight : float
-        Fraction of the visible weight of the scene in the cell and its margin.
-    extent : float, world units
-        Extent of the cameras of the block.
-    skipped : str
-        Reason if the block is not trained, else empty.
-    """
-
-    name: str
-    views: tuple[str, ...]
-    floor: int
-    own: int
-    frozen: int
-    core: int
-    weight: float
-    extent: float
-    skipped: str = ""
+    name: str  # grid indices, ``1-3``
+    views: tuple[str, ...]  # training photographs, in the order of the scene; () if the block is not trained
+    floor: int  # number of photographs that were added to reach ``Partition.min_views``
+    own: int  # coarse splats that are trained
+    frozen: int  # coarse splats that are frozen
+    core: int  # coarse splats that lie in the cell
+    weight: float  # fraction of the visible weight of the scene in the cell and its margin
+    extent: float  # of the cameras of the block, world units
+    skipped: str = ""  # reason if the block is not trained, else empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,17 +83,9 @@ def split_model(
     folder: Path,
     on_event: OnEvent,
 ) -> Split:
-    """Cut a coarse model into blocks; write their start files ``BLOCK.npz``, then ``cells.json``.
+    """Cut a coarse model into the blocks of a partition with a grid; write ``BLOCK.npz``, then ``cells.json``.
 
-    Parameters
-    ----------
-    partition : Partition
-        With a grid.
-
-    Raises
-    ------
-    DataError
-        If no photograph shows the model.
+    Raises DataError if no photograph shows the model.
     """
     splats, scene, looks = trained.splats, trained.scene, Looks(trained)
     places = splats.means.detach().cpu().numpy()
@@ -157,10 +131,7 @@ def split_seams(
 ) -> tuple[str, ...]:
     """Write the start file of the visible splats at seams of a merged scene; parameters as of ``split_model``.
 
-    Returns
-    -------
-    tuple of str
-        Photographs that show these splats with at least half of ``Partition.min_share``; () if there are none.
+    Returns photographs that show these splats with at least half of ``Partition.min_share``; () if there are none.
     """
     splats, scene = trained.splats, trained.scene
     places, width = splats.means.detach().cpu().numpy(), partition.seam * split.cells.side
@@ -238,14 +209,8 @@ def _points(scene: Scene) -> np.ndarray | None:
 def merge(coarse: Splats, split: Split, trained: dict[str, Splats], rows: dict[str, np.ndarray]) -> Splats:
     """Return the merged scene: for each block, the splats whose centre lies in its cell.
 
-    These are the trained splats of the block, then coarse splats that it did not train.
-
-    Parameters
-    ----------
-    trained : dict of name to Splats
-        Splats of the trained blocks.
-    rows : dict of name to ndarray [N]
-        Kinds of the coarse splats, from the start files of these blocks.
+    These are the trained splats of the block (``trained``, by name), then coarse splats that it did not train. ``rows``
+    has the kinds [N] of the coarse splats, from the start files of these blocks.
     """
     owner = split.cells.owners(coarse.means.detach().cpu().numpy())
     parts = []

@@ -12,53 +12,34 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class IcpStage:
-    """One stage of the alignment, in units of tau.
+    """One stage of the alignment, in units of tau."""
 
-    Attributes
-    ----------
-    voxel : float or None
-        Both clouds are thinned to one point in each cube of this side; None: to at most ``max_points`` each.
-    threshold : float
-        Pairs farther apart do not count.
-    iterations : int
-        At most.
-    """
-
+    # Both clouds are thinned to one point in each cube of this side; None: to at most ``max_points`` each.
     voxel: float | None
-    threshold: float
-    iterations: int
+    threshold: float  # pairs farther apart do not count
+    iterations: int  # at most
 
 
 @dataclass(frozen=True)
 class TntSurface:
-    """F-score of Tanks and Temples.
+    """F-score of Tanks and Temples."""
 
-    Attributes
-    ----------
-    camera_threshold : float
-        m. Camera centres that agree within it are inliers.
-    camera_sample : int
-        Pairs in a random sample.
-    max_points : int
-        Of each cloud in a stage without a voxel.
-    fraction_change, rms_change : float
-        A stage ends when the share of paired points and their rms (m) change by less, both.
-    score_voxel : float
-        tau. Both clouds are thinned to it before they are scored.
-    min_camera_fraction, min_fraction, max_shift, max_scale_change : float
-        The self-check: share of inlier cameras, share of the mesh that the first stage pairs, how far the stages may
-        move the mesh (tau), and by how much they may change its size.
-    """
-
+    # m. Camera centres that agree within it are inliers.
     camera_threshold: float = 0.2  # [tnt]
+    # pairs in a random sample
     camera_sample: int = 6  # [tnt]
     # [tnt] states 20 iterations but passes them as the rms criterion. Open3D therefore uses its default, 30 iterations,
     # and stops by the share of paired points only.
     stages: tuple[IcpStage, ...] = (IcpStage(1.0, 80.0, 30), IcpStage(0.5, 20.0, 30), IcpStage(None, 2.0, 30))  # [tnt]
+    # Of each cloud in a stage without a voxel.
     max_points: int = 4_000_000  # [tnt]
+    # A stage ends when the share of paired points and their rms (m) change by less, both.
     fraction_change: float = 1e-6  # [tnt]
     rms_change: float = 20.0  # [tnt] in effect off
+    # tau. Both clouds are thinned to it before they are scored.
     score_voxel: float = 0.5  # [tnt]
+    # The self-check: share of inlier cameras, share of the mesh that the first stage pairs, how far the stages may move
+    # the mesh (tau), and by how much they may change its size.
     min_camera_fraction: float = (
         0.75  # [d] all cameras of all scenes of the official logs agree when the frame is right
     )
@@ -69,28 +50,19 @@ class TntSurface:
 
 @dataclass(frozen=True)
 class DtuSurface:
-    """Chamfer distance of DTU, mm.
+    """Chamfer distance of DTU, mm."""
 
-    Attributes
-    ----------
-    density : float
-        mm. Spacing of points on the mesh; no two are nearer.
-    margin_low, margin_high : float
-        mm by which the bounding box of the observation mask is widened at its lower and upper corner.
-    max_distance : float
-        mm. Distances from here on are dropped.
-    dilation : float
-        px of an image ``dilation_width`` wide: the silhouettes that cull the mesh are widened by this radius.
-    min_fraction : float
-        The self-check: at least this part of the points lies within ``max_distance`` of the scan.
-    """
-
+    # Spacing of points on the mesh; no two are nearer.
     density: float = 0.2  # [dtu]
+    # By these the bounding box of the observation mask is widened at its lower and upper corner.
     margin_low: float = 60.0  # [dtu] patch_size
     margin_high: float = 120.0  # [dtu] twice patch_size
+    # Distances from here on are dropped.
     max_distance: float = 20.0  # [dtu]
+    # px of an image ``dilation_width`` wide: the silhouettes that cull the mesh are widened by this radius.
     dilation: float = 24.0  # [s] a disk of radius 24
     dilation_width: int = 1600  # [s] the hard-coded 1600 x 1200
+    # The self-check: at least this part of the points lies within ``max_distance`` of the scan.
     min_fraction: float = 0.5  # [d]
 
 
@@ -100,23 +72,15 @@ DTU_SURFACE = DtuSurface()
 
 @dataclass(frozen=True)
 class VisibleSurfaceProtocol:
-    """Ours: Chamfer and F-score over the surface that the training cameras see (docs/guides/evaluation.md).
+    """Ours: Chamfer and F-score over the surface that the training cameras see (docs/guides/evaluation.md)."""
 
-    Attributes
-    ----------
-    samples : int
-        Points on each surface, area-weighted, from a seed.
-    fractions : tuple of float
-        Thresholds, of the diagonal of the true bounding box; the headline figures are those at the first.
-    min_views : int
-        True surface seen by fewer training views does not count.
-    seen_tolerance : float
-        Of the diagonal: how far behind the depth buffer a point still counts as visible.
-    """
-
+    # Points on each surface, area-weighted, from a seed.
     samples: int = 200_000  # [d] all of it: no public protocol exists for NeRF-Synthetic meshes
+    # Thresholds, of the diagonal of the true bounding box; the headline figures are those at the first.
     fractions: tuple[float, ...] = (0.0025, 0.005, 0.01)  # [d] the strictest first: at 0.5 % all methods look alike
+    # True surface seen by fewer training views does not count.
     min_views: int = 3  # [d] fewer views cannot tell where a surface is
+    # Of the diagonal: how far behind the depth buffer a point still counts as visible.
     seen_tolerance: float = 0.002  # [d] against ray-cast counts: 2 % of the area more, 0.2 % less
 
 

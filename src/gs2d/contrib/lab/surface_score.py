@@ -134,21 +134,13 @@ _FEW = 50_000  # points
 
 @dataclass(frozen=True, eq=False)
 class ScoredClouds:
-    """Scored points of both surfaces with their distances to the other surface, in one coordinate system.
+    """Scored points of both surfaces, with their distances to the other surface, in one coordinate system."""
 
-    Attributes
-    ----------
-    mesh, truth : ndarray [P, 3], [Q, 3]
-    mesh_distances, truth_distances : ndarray [P], [Q]
-    tau : float
-        Threshold, in the same units.
-    """
-
-    mesh: np.ndarray
+    mesh: np.ndarray  # [P, 3], with distances [P]
     mesh_distances: np.ndarray
-    truth: np.ndarray
+    truth: np.ndarray  # [Q, 3], with distances [Q]
     truth_distances: np.ndarray
-    tau: float
+    tau: float  # threshold, in the same units
 
 
 def distance_colors(distances: np.ndarray, tau: float) -> np.ndarray:
@@ -232,36 +224,22 @@ class ThresholdScore:
 
 @dataclass(frozen=True)
 class SurfaceScore:
-    """Distances between two surfaces, in units of the truth; None, with ``reason``, if nothing can be measured.
+    """Distances between two surfaces, in units of the truth; None, with ``reason``, if nothing can be measured."""
 
-    Attributes
-    ----------
-    accuracy, completeness : float or None
-        Mean distance from the reconstruction to the truth, and from the truth to the reconstruction.
-    chamfer : float or None
-        Their mean.
-    diagonal : float
-        Of the bounding box of the truth.
-    mesh_points, truth_points : int
-        Number of scored points.
-    mesh_hidden, truth_hidden : float
-        Fraction of the area (of the points, for a cloud) that the cameras do not see, and that is not scored.
-    clouds : ScoredClouds or None
-        The scored points with their distances, in the frame and units of the mesh; tau is the first threshold.
-    """
-
-    accuracy: float | None
-    completeness: float | None
-    chamfer: float | None
+    accuracy: float | None  # mean distance from the reconstruction to the truth
+    completeness: float | None  # mean distance from the truth to the reconstruction
+    chamfer: float | None  # the mean of both
     accuracy_median: float | None
     completeness_median: float | None
     scores: tuple[ThresholdScore, ...]
-    diagonal: float
-    mesh_points: int
+    diagonal: float  # of the bounding box of the truth
+    mesh_points: int  # number of scored points
     truth_points: int
+    # fraction of the area (of the points, for a cloud) that the cameras do not see, which is not scored
     mesh_hidden: float
     truth_hidden: float
     reason: str | None = None
+    # The scored points with their distances, in the frame and units of the mesh; tau is the first threshold.
     clouds: ScoredClouds | None = field(default=None, repr=False, compare=False)
 
 
@@ -284,31 +262,16 @@ def evaluate_surface(
     thresholds: Sequence[float] | None = None,
     samples: int = VISIBLE_SURFACE.samples,
 ) -> SurfaceScore:
-    """Score a reconstruction.
+    """Score a mesh in the frame of the cameras against a true surface or points [P, 3] in their own frame.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        The reconstruction, in the frame of the cameras.
-    truth : Mesh or ndarray [P, 3]
-        True surface or point cloud, in its own frame.
-    cameras : sequence of Camera
-        Cameras that determine the visible surface. Without them all surface is scored, unless ``seen`` is set.
-    seen : ndarray [F], optional
-        Number of views that see each true face.
-    min_views : int
-        True surface seen by fewer views is not scored.
-    T_truth_mesh : ndarray [4, 4], optional
-        Similarity transform from the frame of the mesh to that of the truth.
-    thresholds : sequence of float, optional
-        In units of the truth; default 0.25 %, 0.5 % and 1 % of the diagonal of its bounding box.
-    samples : int
-        Points on each surface.
+    The cameras determine the visible surface; without them all surface is scored, unless ``seen`` [F] has the number of
+    views that see each true face. True surface seen by fewer than ``min_views`` is not scored. ``T_truth_mesh`` [4, 4]
+    is a similarity transform from the frame of the mesh to that of the truth. ``thresholds`` are in units of the truth;
+    default 0.25 %, 0.5 % and 1 % of the diagonal of its bounding box. ``samples`` is the number of points on each
+    surface.
 
-    Raises
-    ------
-    DataError
-        If the truth is empty, no part of it is visible, or the length of ``seen`` differs from its number of faces.
+    Raises DataError if the truth is empty, no part of it is visible, or the length of ``seen`` differs from its number
+    of faces.
     """
     T = np.eye(4) if T_truth_mesh is None else np.asarray(T_truth_mesh, dtype=np.float64)
     scale = similarity_scale(T, "T_truth_mesh")

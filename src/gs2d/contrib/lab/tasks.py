@@ -25,46 +25,20 @@ _OUTCOME = {"state": str, "reason?": str, "notes?": (dict, None), "wanted?": [st
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """A piece of work, as a frozen dataclass of plain values and paths that can be pickled.
+    """A piece of work, as a frozen dataclass of plain values and paths that can be pickled."""
 
-    Attributes
-    ----------
-    name : str
-        Unique name, valid as a file name.
-    record : Path
-        File of the outcome.
-    after : tuple of str
-        Names of tasks that must finish first.
-    inputs, outputs : tuple of Path
-        Files in the output folder that the task reads and writes. A task is finished only while its outputs exist.
-    alone : bool
-        Whether the task runs alone, with all CPU threads.
-    retries : int
-        Number of restarts, from the last checkpoint, if its process dies.
-    memory : float or None, GiB
-        Memory limit.
-    gpu : bool
-        Whether the task uses a GPU, if the backend does.
-    """
-
-    name: str
-    record: Path
-    after: tuple[str, ...] = ()
-    inputs: tuple[Path, ...] = ()
-    outputs: tuple[Path, ...] = ()
-    alone: bool = False
-    retries: int = 0
-    memory: float | None = None
-    gpu: bool = True
+    name: str  # unique, valid as a file name
+    record: Path  # file of the outcome
+    after: tuple[str, ...] = ()  # names of tasks that must finish first
+    inputs: tuple[Path, ...] = ()  # files in the output folder that the task reads
+    outputs: tuple[Path, ...] = ()  # files there that it writes; a task is finished only while they exist
+    alone: bool = False  # whether the task runs alone, with all CPU threads
+    retries: int = 0  # number of restarts, from the last checkpoint, if its process dies
+    memory: float | None = None  # limit, GiB
+    gpu: bool = True  # whether the task uses a GPU, if the backend does
 
     def outcome(self) -> dict[str, Any]:
-        """Return the record: ``state`` (new, running, done or failed), ``reason``, and results of the task.
-
-        Raises
-        ------
-        DataError, RunError
-            If the record is damaged.
-        """
+        """Return the record: ``state`` (new, running, done or failed), ``reason``, and results of the task."""
         if not self.record.exists():
             return {"state": "new"}
         found: dict[str, Any] = read_json(self.record)
@@ -97,13 +71,7 @@ class Task(ABC):
 
     @abstractmethod
     def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Run the task, or continue it; return entries of its record.
-
-        Raises
-        ------
-        Gs2dError
-            If the user has to act.
-        """
+        """Run the task, or continue it; return entries of its record, or raise Gs2dError if the user has to act."""
 
 
 AnyTask = TypeVar("AnyTask", bound=Task)

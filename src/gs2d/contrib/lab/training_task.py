@@ -19,22 +19,12 @@ class TrainingTask(Task):
 
     Tasks whose recipes begin with the same stages share them through the stage cache. A task waits while another one
     trains its next stage.
-
-    Attributes
-    ----------
-    train : TrainOptions
-        Options with ``resume`` and the shared stage cache.
-    evaluate : EvaluateOptions or None
-        Scores beyond those of training.
-    stage_keys : tuple of str
-        One key per stage; tasks with equal keys train the same stage.
-    wanted : tuple of str
-        Names of the scores and their inputs. A finished task is scored again if its record lacks one.
     """
 
-    train: TrainOptions
-    evaluate: EvaluateOptions | None = None
-    stage_keys: tuple[str, ...] = ()
+    train: TrainOptions  # with ``resume`` and the shared stage cache
+    evaluate: EvaluateOptions | None = None  # scores beyond those of training
+    stage_keys: tuple[str, ...] = ()  # one per stage; tasks with equal keys train the same stage
+    # names of the scores and their inputs; a finished task is scored again if its record lacks one
     wanted: tuple[str, ...] = ()
 
     def is_trained(self) -> bool:
@@ -78,13 +68,7 @@ def stage_keys(facts: Sequence[Any], stages: Sequence[Any]) -> tuple[str, ...]:
 
 
 def train_and_evaluate(task: TrainingTask, on_event: OnEvent) -> dict[str, str]:
-    """Train and score one run; return why the surface has no scores, as ``{"surface": reason}``, else {}.
-
-    Raises
-    ------
-    Gs2dError
-        If training fails.
-    """
+    """Train and score one run; return why the surface has no scores, as ``{"surface": reason}``, else {}."""
     from gs2d.pipeline.finish.evaluate import evaluate_run
     from gs2d.pipeline.train.train_run import train
 

@@ -26,25 +26,16 @@ from gs2d.io.run_dir import make_folder
 
 @dataclass(frozen=True, eq=False)
 class OfficialTruth:
-    """The files of an official ground truth.
-
-    Attributes
-    ----------
-    files : mapping of str to Path
-        By kind, as of ``gs2d.contrib.lab.dataset_folders.find_truth``.
-    """
+    """The files of an official ground truth."""
 
     facts: SceneFacts
-    files: Mapping[str, Path]
+    files: Mapping[str, Path]  # by kind, as of ``gs2d.contrib.lab.dataset_folders.find_truth``
 
 
 def find_official(name: str, capture: Path, given: Path | None, tell: Callable[[str], None]) -> OfficialTruth | None:
     """Return the official ground truth of a capture, if its data set has the evaluator ``name``.
 
-    Raises
-    ------
-    DataError
-        If the folder ``given`` lacks files of this scene.
+    Raises DataError if the folder ``given`` lacks files of this scene.
     """
     known = None if given is not None and not given.is_dir() else recognise(capture, given)
     if known is None or known[0].evaluator != name:

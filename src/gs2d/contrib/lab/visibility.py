@@ -18,16 +18,9 @@ NEAR = 1e-9  # world units; occluders at any distance count, in captures of any 
 
 
 def visible_counts(points: np.ndarray, mesh: Mesh, cameras: Sequence[Camera], *, tolerance: float) -> np.ndarray:
-    """Count the views in which each point [P, 3] is visible, with the mesh as the only occluder.
+    """Count the views in which each point [P, 3] is visible, int64 [P], with the mesh as the only occluder.
 
-    Parameters
-    ----------
-    tolerance : float, world units
-        See ``shown_points``.
-
-    Returns
-    -------
-    ndarray [P] int64
+    ``tolerance`` (world units) as of ``shown_points``.
     """
     vertices = mesh.vertices.astype(np.float64)
 

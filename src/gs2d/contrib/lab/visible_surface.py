@@ -32,18 +32,11 @@ SEEN_SUFFIX = "_seen.npy"  # FILE_seen.npy beside FILE.ply: number of views that
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A true surface for the visible-surface protocol.
-
-    Attributes
-    ----------
-    surface : Mesh, or ndarray [P, 3] of points
-    seen : ndarray [F] or None
-        Number of training views that see each face.
-    """
+    """A true surface for the visible-surface protocol."""
 
     path: Path
-    surface: Mesh | np.ndarray
-    seen: np.ndarray | None
+    surface: Mesh | np.ndarray  # a mesh, or points [P, 3]
+    seen: np.ndarray | None  # [F] number of training views that see each face
 
 
 def read_truth(path: Path) -> Truth:

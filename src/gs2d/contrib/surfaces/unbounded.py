@@ -74,23 +74,12 @@ PIXEL_ERROR = 0.5  # px; matching error between views, which limits how far away
 
 @dataclass(frozen=True)
 class TsdfCascade:
-    """Levels of an unbounded fusion, finest first.
+    """Levels of an unbounded fusion, finest first."""
 
-    Attributes
-    ----------
-    levels : tuple of FusionBounds
-        ``lower`` of a level is the centre of its first voxel.
-    voxels : int
-        Number of voxels along a side of every level, a multiple of ``STEP``.
-    center : tuple of 3 floats, world units
-    half : float, world units
-        Half the side of the innermost cube.
-    """
-
-    levels: tuple[FusionBounds, ...]
-    voxels: int
-    center: tuple[float, float, float]
-    half: float
+    levels: tuple[FusionBounds, ...]  # ``lower`` of a level is the centre of its first voxel
+    voxels: int  # along a side of every level, a multiple of ``STEP``
+    center: tuple[float, float, float]  # world units
+    half: float  # half the side of the innermost cube, world units
 
     @property
     def dims(self) -> tuple[int, int, int]:
@@ -127,24 +116,12 @@ def derive_cascade(
 ) -> TsdfCascade:
     """Derive the levels of a scene from samples of all views; requested limits override derived ones.
 
-    The innermost cube contains the 1st to 99th percentile of the nearer half of the points. The outermost contains all
-    points up to the depth limit: 1.25 times the 99.5th percentile of depth, but not beyond the depth that is known to
-    within the truncation (``valid_depth``), where sky and textureless walls create false surfaces.
-
-    Parameters
-    ----------
-    resolution : int
-        Voxels along the side of the innermost cube, not finer than half the median pixel of the nearer half.
-    bbox : array [2, 3] world units, optional
-        Contained in the innermost cube.
-    voxel, truncation : float world units, optional
-        Of the innermost level.
-    depth_limit : float world units, optional
-
-    Raises
-    ------
-    ProtocolError
-        If no pixel has a depth, or a requested limit is invalid.
+    The innermost cube contains ``bbox`` [2, 3], or the 1st to 99th percentile of the nearer half of the points. Its
+    side has ``resolution`` voxels, not finer than half the median pixel of the nearer half; ``voxel`` and
+    ``truncation`` (world units) are those of this level. The outermost contains all points up to the depth limit: 1.25
+    times the 99.5th percentile of depth, but not beyond the depth that is known to within the truncation
+    (``valid_depth``), where sky and textureless walls create false surfaces. Raises ProtocolError if no pixel has a
+    depth, or a requested limit is invalid.
     """
     xyz = np.concatenate([s.points for s in samples]) if samples else np.zeros((0, 3))
     depths = np.concatenate([s.depths for s in samples]) if samples else np.zeros(0)
@@ -345,20 +322,9 @@ def fused_cascade_surface(
     """Fuse depth maps into all levels, and extract the zero level set as one mesh.
 
     Levels are fused slab by slab (``slabs``), several small slabs at a time; the mesh does not depend on their size.
-    Blocks at the border between two levels stay in memory until both are finished.
-
-    Parameters
-    ----------
-    frames : iterable of DepthMap
-        Read once for each batch of slabs: a sequence or a ``Spool``.
-    blocks : sequence of VolumeBlocks
-        Of each level, from ``find_cascade_blocks``.
-    min_weight, far_weight : float
-        Smallest weight of known voxels in the innermost level, and in all others.
-    slab_bytes : int
-        See ``fused_surface``.
-    backend
-        As for ``fuse_blocks``.
+    Blocks at the border between two levels stay in memory until both are finished. ``frames`` are read once for each
+    batch of slabs: a sequence or a ``Spool``. ``blocks`` of each level are from ``find_cascade_blocks``. ``min_weight``
+    and ``far_weight`` are the smallest weights of known voxels in the innermost level, and in all others.
     """
     surface = CascadeSurface(cascade, [len(part.keys) for part in blocks], min_weight, far_weight)
     for level, part in enumerate(blocks):
@@ -545,20 +511,8 @@ def extract_unbounded(
 ) -> Extraction:
     """Fuse depth maps of an unbounded scene into a mesh, with voxels that grow with the distance from its centre.
 
-    Parameters
-    ----------
-    frames, options, threads, backend
-        As for ``extract``.
-
-    Returns
-    -------
-    Extraction
-        ``limits`` are those of the innermost level, with ``lower`` and ``upper`` of the outermost.
-
-    Raises
-    ------
-    ProtocolError, ShapeError, DiskError, BackendError
-        As ``extract``.
+    Parameters and errors are those of ``extract``; ``limits`` of the result are those of the innermost level, with
+    ``lower`` and ``upper`` of the outermost.
     """
     backend = fusion_backend(backend)
     spool, samples = spooled(frames, threads)

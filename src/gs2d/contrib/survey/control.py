@@ -90,15 +90,8 @@ def _add(
 def locate(points: Sequence[ControlPoint], views: Sequence[View], held_out: Sequence[str] = ()) -> Located:
     """Locate control points in the run by triangulating their marks.
 
-    Parameters
-    ----------
-    held_out : sequence of str
-        Names of additional check points.
-
-    Raises
-    ------
-    DataError
-        If a photograph is missing, a point has too few marks, or a check point is unknown.
+    ``held_out`` names additional check points. Raises DataError if a photograph is missing, a point has too few marks,
+    or a check point is unknown.
     """
     if unknown := [name for name in held_out if name not in {point.name for point in points}]:
         raise DataError(

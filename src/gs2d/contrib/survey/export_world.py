@@ -33,15 +33,8 @@ _TO_GLTF = np.array([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])  # z up to the y
 def export_world(path: Path, out: Path, part: str = "splats") -> dict[str, Any]:
     """Write splats or a mesh of a georeferenced run in local metres.
 
-    Parameters
-    ----------
-    part : "splats", "mesh" or "texture"
-        The splats, in the layout of the ending of ``out``; ``mesh.ply``; or the textured ``mesh.glb`` (.glb or .obj).
-
-    Returns
-    -------
-    dict
-        The file, its frame and offset, and the files beside it.
+    ``part`` is "splats", in the layout of the ending of ``out``; "mesh", ``mesh.ply``; or "texture", the textured
+    ``mesh.glb`` (.glb or .obj). Returns the file, its frame and offset, and the files beside it.
     """
     run, out = open_run(path), Path(out)
     place = required_georeference(run.path)

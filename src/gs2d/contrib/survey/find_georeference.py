@@ -54,12 +54,7 @@ def georeference_run(
 ) -> Georeference | None:
     """Find the georeference of a run and write ``georeference.json``; without a source, read it.
 
-    Other files of the run keep their coordinates.
-
-    Returns
-    -------
-    Georeference or None
-        None if the run has none, or it was removed.
+    Other files of the run keep their coordinates. Returns None if the run has none, or it was removed.
     """
     run = open_run(path)
     sources = [name for name in SOURCES if _is_set(getattr(options, name))]

@@ -30,27 +30,14 @@ Solver = Callable[[np.ndarray, np.ndarray], np.ndarray | None]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A similarity that most positions agree with.
+    """A similarity that most positions agree with."""
 
-    Attributes
-    ----------
-    T : ndarray [4, 4]
-        From the run to the frame of the positions, metres.
-    inliers : ndarray [P] bool
-    residuals : ndarray [P, 3]
-        T source minus target; 0 for an unknown height.
-    tilt : str
-        Source of up: "places" (the fit), "cameras" or "given".
-    scale_error, tilt_error : float
-        Relative standard error of the scale; standard error of the tilt in a fit of all parameters, degrees.
-    """
-
-    T: np.ndarray
-    inliers: np.ndarray
-    residuals: np.ndarray
-    tilt: str
-    scale_error: float
-    tilt_error: float
+    T: np.ndarray  # [4, 4]: from the run to the frame of the positions, metres
+    inliers: np.ndarray  # [P] bool
+    residuals: np.ndarray  # [P, 3]: T source minus target; 0 for an unknown height
+    tilt: str  # source of up: "places" (the fit), "cameras" or "given"
+    scale_error: float  # relative standard error of the scale
+    tilt_error: float  # standard error of the tilt in a fit of all parameters, degrees
 
     @property
     def scale(self) -> float:
@@ -82,23 +69,12 @@ def cameras_up(cameras: Sequence[Camera]) -> np.ndarray | None:
 def fit_places(
     source: np.ndarray, target: np.ndarray, up: np.ndarray | None, *, tilt: str = "cameras", robust: bool = True
 ) -> Fit:
-    """Fit a similarity to positions, without outliers.
+    """Fit a similarity to positions, without outliers if ``robust``.
 
-    Parameters
-    ----------
-    source, target : ndarray [P, 3]
-        Positions in the run, and in metres (z up) relative to an origin; an unknown height is NaN.
-    up : ndarray [3] or None
-        Up direction of the run, used if the positions are less accurate.
-    tilt : "cameras" or "given"
-        Source of ``up``; "given" is always used.
-    robust : bool
-        Whether to leave out outliers.
-
-    Raises
-    ------
-    DataError
-        If there are too few positions, or they do not determine the fit.
+    ``source`` and ``target`` [P, 3] are positions in the run, and in metres (z up) relative to an origin; an unknown
+    height is NaN. ``up`` [3], the up direction of the run, is used if the positions are less accurate; with ``tilt``
+    "given", rather than "cameras", it is always used. Raises DataError if there are too few positions, or they do not
+    determine the fit.
     """
     _check_spread(target)
     whole = np.isfinite(target[:, 2])

@@ -33,19 +33,11 @@ _ROLES: tuple[Role, ...] = (FITTED, LEFT_OUT, CHECK)
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """Error of one image or control point.
-
-    Attributes
-    ----------
-    error : ndarray [3]
-        Transformed position minus measured position, metres, in the axes of the frame.
-    role : "fitted", "left out" or "check"
-        Used in the fit, rejected as an outlier, or held out as a check point.
-    """
+    """Error of one image or control point."""
 
     name: str
-    error: np.ndarray
-    role: Role
+    error: np.ndarray  # [3] transformed position minus measured position, metres, in the axes of the frame
+    role: Role  # used in the fit, rejected as an outlier, or held out as a check point
 
     @property
     def distance(self) -> float:
@@ -55,43 +47,21 @@ class Residual:
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """Scale, rotation and position of a run in the world.
+    """Scale, rotation and position of a run in the world."""
 
-    Attributes
-    ----------
-    scale : float
-        Metres of the frame per unit of the run.
-    rotation : ndarray [3, 3]
-        From the axes of the run to those of the frame.
-    translation : ndarray [3]
-        Metres; small, because ``origin`` has the large part.
-    origin : ndarray [3] float64
-        Origin of local coordinates in the frame: east, north, height; zeros without a geographic frame.
-    method : str
-        Source of the georeference, in words.
-    epsg : int or None
-        Projected coordinate system, if any.
-    geodetic : ndarray [3] or None
-        Latitude, longitude (degrees, WGS 84) and height (m) of the origin, if known.
-    grid_scale : float
-        Metres of the frame per metre on the ground, horizontally: 0.9996 to 1.0004 in UTM, else 1.
-    doubts : tuple of str
-        Warnings, one sentence each.
-    facts : mapping
-        Further results of the method, as JSON values.
-    """
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    scale: float  # metres of the frame per unit of the run
+    rotation: np.ndarray  # [3, 3]: from the axes of the run to those of the frame
+    translation: np.ndarray  # [3] metres; small, because ``origin`` has the large part
+    # [3] float64 of local coordinates in the frame: east, north, height; zeros without a geographic frame
     origin: np.ndarray
-    method: str
-    epsg: int | None = None
-    geodetic: np.ndarray | None = None
+    method: str  # source of the georeference, in words
+    epsg: int | None = None  # projected coordinate system, if any
+    geodetic: np.ndarray | None = None  # [3] latitude, longitude (degrees, WGS 84) and height (m) of the origin
+    # metres of the frame per metre on the ground, horizontally: 0.9996 to 1.0004 in UTM, else 1
     grid_scale: float = 1.0
     residuals: tuple[Residual, ...] = ()
-    doubts: tuple[str, ...] = ()
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()  # warnings, one sentence each
+    facts: Mapping[str, Any] = field(default_factory=dict)  # further results of the method, as JSON values
 
     @property
     def metres_per_unit(self) -> float:
@@ -177,13 +147,7 @@ class Georeference:
 
     @classmethod
     def from_json(cls, data: Any) -> Georeference:
-        """Convert the result of ``to_json``.
-
-        Raises
-        ------
-        DataError
-            If a field is missing or invalid.
-        """
+        """Convert the result of ``to_json``; DataError if a field is missing or invalid."""
         if not isinstance(data, Mapping):
             raise DataError(f"a georeference must be an object, got {type(data).__name__}")
         if data.get("format") != FORMAT:
@@ -206,13 +170,7 @@ class Georeference:
 
 
 def read_georeference(run: Path) -> Georeference | None:
-    """Read the georeference of a run folder; None without one.
-
-    Raises
-    ------
-    DataError
-        If ``georeference.json`` is damaged.
-    """
+    """Read the georeference of a run folder; None without one, DataError if ``georeference.json`` is damaged."""
     path = Path(run) / GEOREFERENCE
     if not path.exists():
         return None

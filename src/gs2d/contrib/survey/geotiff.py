@@ -24,18 +24,9 @@ def write_geotiff(
 ) -> None:
     """Write a raster with rows from north to south and columns from west to east.
 
-    Parameters
-    ----------
-    raster : ndarray [H, W, 4] uint8 or [H, W] float32
-        Colours with alpha, or elevations in metres with :data:`NO_DATA`.
-    corner : (float, float), metres
-        Easting and northing of the upper left corner.
-    step : float, metres
-        Cell size.
-    epsg : int or None
-        Projected coordinate system; None: a local one.
-    frame : str
-        Name of the coordinate system.
+    The raster [H, W, 4] uint8 has colours with alpha, or [H, W] float32 elevations in metres with :data:`NO_DATA`.
+    ``corner`` (easting, northing) is the upper left one, ``step`` the cell size, both metres. Without ``epsg`` the
+    projected coordinate system is a local one, called ``frame``.
     """
     tifffile = required("geo", "tifffile", "a GeoTIFF")
     colored = raster.ndim == 3

@@ -34,13 +34,7 @@ class Marker:
 
 
 def required_cv2() -> Any:
-    """Return the package cv2, with ArUco.
-
-    Raises
-    ------
-    BackendError
-        If it is not installed, or has no ArUco.
-    """
+    """Return the package cv2, with ArUco, or raise BackendError."""
     cv2 = required("markers", "cv2", "--markers")
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
         raise BackendError(

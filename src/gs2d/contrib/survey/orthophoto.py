@@ -35,20 +35,11 @@ _NICE = (1.0, 2.0, 2.5, 5.0, 10.0)  # default resolutions, times a power of ten
 
 @dataclass(frozen=True)
 class Raster:
-    """Position and size of a raster.
+    """Position and size of a raster."""
 
-    Attributes
-    ----------
-    corner : (float, float), metres
-        Local x and y of the upper left corner.
-    step : float, metres
-    size : (int, int)
-        Rows and columns.
-    """
-
-    corner: tuple[float, float]
-    step: float
-    size: tuple[int, int]
+    corner: tuple[float, float]  # local x and y of the upper left corner, metres
+    step: float  # metres
+    size: tuple[int, int]  # rows and columns
 
 
 def orthophoto_run(

@@ -15,33 +15,18 @@ from gs2d.errors import BackendError, DataError
 
 @dataclass(frozen=True, eq=False)
 class MapFrame:
-    """The coordinate system of positions.
+    """The coordinate system of positions."""
 
-    Attributes
-    ----------
-    epsg : int or None
-        None: east, north, up of ``geodetic``, or an unnamed system.
-    origin : ndarray [3]
-        Origin of local coordinates in this system, in whole metres.
-    geodetic : ndarray [3] or None
-        The origin as latitude, longitude, height.
-    grid_scale : float
-        Map metres per metre on the ground.
-    """
-
-    epsg: int | None
-    origin: np.ndarray
-    geodetic: np.ndarray | None
-    grid_scale: float
+    epsg: int | None  # None: east, north, up of ``geodetic``, or an unnamed system
+    origin: np.ndarray  # [3] of local coordinates in this system, in whole metres
+    geodetic: np.ndarray | None  # [3] the origin as latitude, longitude, height
+    grid_scale: float  # map metres per metre on the ground
 
 
 def utm_epsg(latitude: float, longitude: float) -> int:
     """Return the EPSG code of the UTM zone, including the exceptions for Norway and Svalbard.
 
-    Raises
-    ------
-    DataError
-        Beyond 84 degrees north or 80 degrees south, where UTM is undefined.
+    Raises DataError beyond 84 degrees north or 80 degrees south, where UTM is undefined.
     """
     if not -80 <= latitude <= 84:
         raise DataError(
@@ -82,13 +67,7 @@ class Projection:
             raise DataError(f"EPSG:{self.epsg} must be in metres, {crs.name} is in {crs.axis_info[0].unit_name}")
 
     def from_geodetic(self, geodetic: np.ndarray) -> np.ndarray:
-        """Convert latitude, longitude, height [P, 3] to east, north, height [P, 3].
-
-        Raises
-        ------
-        DataError
-            If a position is outside the domain of the projection.
-        """
+        """Convert latitude, longitude, height [P, 3] to east, north, height [P, 3]; DataError outside the domain."""
         pyproj = required_pyproj()
         transform = pyproj.Transformer.from_crs(WGS84, self.epsg, always_xy=True)
         east, north = transform.transform(geodetic[:, 1], geodetic[:, 0])
@@ -116,14 +95,9 @@ def in_frame(
 ) -> tuple[np.ndarray, MapFrame]:
     """Return positions [P, 3] relative to the origin of a frame, in metres, and the frame.
 
-    Parameters
-    ----------
-    epsg : int or None
-        Coordinate system of the positions; None: latitude, longitude, height.
-    requested : int or None
-        Projected system to use; None: the system of the positions, or their UTM zone.
-    enu : bool
-        Use east, north and up of the median instead; for latitudes and longitudes only.
+    ``epsg`` is the coordinate system of the positions; None: latitude, longitude, height. ``requested`` is the
+    projected system to use; None: that of the positions, or their UTM zone. ``enu`` uses east, north and up of the
+    median instead, for latitudes and longitudes only.
     """
     height = np.nanmedian(positions[:, 2]) if np.isfinite(positions[:, 2]).any() else 0.0
     middle = np.array([*np.median(positions[:, :2], axis=0), height])

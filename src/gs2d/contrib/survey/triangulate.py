@@ -25,21 +25,10 @@ class Triangulated:
 
 
 def triangulate(views: Sequence[View], marks: np.ndarray, name: str) -> Triangulated:
-    """Return the point with the least reprojection error.
+    """Return the point with the least reprojection error of its marks.
 
-    Parameters
-    ----------
-    views : sequence of View
-        At least two.
-    marks : ndarray [M, 2] px
-        In the image files, from the upper left corner.
-    name : str
-        Name of the point in errors.
-
-    Raises
-    ------
-    DataError
-        If there are fewer than two views, the rays are nearly parallel, or the point is behind a camera.
+    ``marks`` [M, 2] are px in the image files, from the upper left corner. ``name`` is that of the point in errors:
+    DataError if there are fewer than two views, the rays are nearly parallel, or the point is behind a camera.
     """
     if len(views) < 2:
         raise DataError(f"{name} must be marked in at least two photographs, got {len(views)}")
@@ -64,13 +53,7 @@ def triangulate(views: Sequence[View], marks: np.ndarray, name: str) -> Triangul
 
 
 def _ideal(k: Intrinsics, pixel: np.ndarray) -> np.ndarray:
-    """Return the point [2] of the plane z = 1 at a pixel [2], by Newton's method.
-
-    Raises
-    ------
-    DataError
-        If the lens maps no ray to the pixel.
-    """
+    """Return the point [2] of the plane z = 1 at a pixel [2], by Newton's method; DataError if no ray maps to it."""
     bent = (np.asarray(pixel, np.float64) - (k.cx, k.cy)) / (k.fx, k.fy)
     if k.lens is None:
         return np.asarray(bent)
