@@ -69,20 +69,9 @@ class _RecordingFile(io.FileIO):
 def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
     r"""Open a file for writing that gets its name only when it is complete.
 
-    Data is written to a hidden temporary file in the same folder, synchronised to disk (fsync) and renamed. If writing
-    fails, the temporary file is removed and an existing file stays unchanged.
-
-    Parameters
-    ----------
-    path : path
-        The file to write. Its folder must exist.
-    mode : "wb" or "w"
-        Bytes, or text in UTF-8 with ``\n`` line ends.
-
-    Raises
-    ------
-    DiskError
-        If the file cannot be written.
+    Data is written to a hidden temporary file in the same folder, which must exist, synchronised to disk (fsync) and
+    renamed. If writing fails, the temporary file is removed, an existing file stays unchanged, and DiskError is raised.
+    ``mode`` is "wb" for bytes, or "w" for text in UTF-8 with ``\n`` line ends.
     """
     if mode not in ("wb", "w"):
         raise ValueError(f"mode must be 'wb' or 'w', got {mode!r}")

@@ -18,24 +18,11 @@ def _parsed(pattern: str) -> tuple[tuple[str, int | None], ...]:
 def check_shapes(arrays: Mapping[str, tuple[Any, str]]) -> dict[str, int]:
     """Check arrays against shape patterns and return the size of each named dimension.
 
-    Parameters
-    ----------
-    arrays : mapping of name to (array, pattern)
-        Anything with a ``.shape``. A pattern is words: an integer must match exactly, a name must have the
-        same size wherever it occurs, ``_`` matches any size. ``"N 3"`` is [N, 3]; ``""`` is a scalar.
+    ``arrays`` maps a name to an array, anything with a ``.shape``, and its pattern. A pattern is words: an integer must
+    match exactly, a name must have the same size wherever it occurs, ``_`` matches any size. ``"N 3"`` is [N, 3];
+    ``""`` is a scalar. A ShapeError names the first array that does not match, and the array that defined the
+    dimension.
 
-    Returns
-    -------
-    dict of str to int
-        The size of each named dimension.
-
-    Raises
-    ------
-    ShapeError
-        Names the first array that does not match, and the array that defined the dimension.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> check_shapes({"means": (np.zeros((5, 3)), "N 3"), "quats": (np.zeros((5, 4)), "N 4")})
     {'N': 5}

@@ -36,20 +36,9 @@ def install(extra: str) -> str:
 
 
 def required(extra: str, module: str, what: str, otherwise: str = "") -> Any:
-    """Import a module of an extra.
+    """Import a module of an extra; BackendError if it is not installed.
 
-    Parameters
-    ----------
-    extra, module : str
-    what : str
-        Feature that needs the module, for the message.
-    otherwise : str
-        Alternative without the module.
-
-    Raises
-    ------
-    BackendError
-        If it is not installed.
+    The message names ``what`` needs it, a feature, and ``otherwise``, the alternative without it.
     """
     try:
         return importlib.import_module(module)

@@ -49,14 +49,7 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
 def composite(image: np.ndarray, background: Sequence[float] | np.ndarray) -> np.ndarray:
     """Composite an image with straight alpha over a background: c alpha + (1 - alpha) b.
 
-    Parameters
-    ----------
-    image : ndarray uint8 [H, W, 3 or 4]
-    background : 3 floats in [0, 1]
-
-    Returns
-    -------
-    ndarray float32 [H, W, 3] in [0, 1]
+    The image is uint8 [H, W, 3 or 4], the background 3 floats in [0, 1], the result float32 [H, W, 3] in [0, 1].
     """
     rgb = np.divide(image[:, :, :3], np.float32(255), dtype=np.float32)
     if image.shape[2] == 3:
@@ -74,18 +67,9 @@ _BAND = 1 << 21  # px averaged at a time
 
 
 def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
-    """Average n x n blocks of pixels; leftover rows and columns are cut.
+    """Average n x n blocks of pixels, rounded to nearest; leftover rows and columns are cut.
 
-    Colour is averaged premultiplied by alpha and stored straight.
-
-    Parameters
-    ----------
-    image : ndarray uint8 [H, W, 3 or 4]
-    factor : int >= 1
-
-    Returns
-    -------
-    ndarray uint8 [H // n, W // n, 3 or 4], rounded to nearest
+    Images are uint8 [H, W, 3 or 4]. Colour is averaged premultiplied by alpha and stored straight.
     """
     if factor == 1:
         return image

@@ -14,12 +14,7 @@ from gs2d.errors import DataError
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Write JSON atomically: UTF-8, two spaces of indent, keys in the given order.
 
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
-    ValueError
-        For NaN or infinity, which JSON does not have.
+    Raises DiskError if the file could not be written, ValueError for NaN or infinity, which JSON does not have.
     """
     text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
     with atomic_write(path, "w") as file:
@@ -27,13 +22,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """Read a JSON file.
-
-    Raises
-    ------
-    DataError
-        If the file is missing or not JSON; names the file and the line.
-    """
+    """Read a JSON file; a DataError for one that is missing or not JSON names the file and the line."""
     name = os.fspath(path)
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # Windows tools write a byte-order mark

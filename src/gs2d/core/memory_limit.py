@@ -18,20 +18,11 @@ _UNLIMITED = 1 << 60  # cgroup v1 reports about 2^63 for no limit
 
 @dataclass(frozen=True)
 class MemoryLimit:
-    """A memory limit and its use by this process.
-
-    Attributes
-    ----------
-    bytes : int
-    used : int
-        Bytes used by this process.
-    source : str
-        Description of the limit.
-    """
+    """A memory limit and its use by this process."""
 
     bytes: int
-    used: int
-    source: str
+    used: int  # bytes
+    source: str  # description of the limit
 
     @property
     def room(self) -> int:
@@ -42,10 +33,7 @@ class MemoryLimit:
 def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
     """Return the limit with the least free memory: cgroup (v1, v2), RLIMIT_AS, machine, ``--memory``; None if unknown.
 
-    Parameters
-    ----------
-    root : path
-        Folder of ``proc`` and ``sys``.
+    ``root`` is the folder of ``proc`` and ``sys``.
     """
     mapped, resident = _own_pages(root)
     found = [MemoryLimit(limit, resident, source) for limit, source in (*_cgroups(root), *_physical(root))]

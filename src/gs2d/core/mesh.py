@@ -55,24 +55,13 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """Triangles with a texture. A vertex on a seam of the texture exists once for each side.
+    """Triangles with a texture. A vertex on a seam of the texture exists once for each side."""
 
-    Attributes
-    ----------
-    vertices : ndarray [P, 3] float, world units
-    normals : ndarray [P, 3] float32, unit
-    faces : ndarray [F, 3] int32
-        Vertex indices, counter-clockwise seen from outside.
-    uv : ndarray [P, 2] float32
-        Texture coordinates, (0, 0) at the upper left and (1, 1) at the lower right corner, as in glTF.
-    texture : ndarray [S, S, 3] uint8, sRGB
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray
-    texture: np.ndarray
+    vertices: np.ndarray  # [P, 3] float, world units
+    normals: np.ndarray  # [P, 3] float32, unit
+    faces: np.ndarray  # [F, 3] int32, vertex indices, counter-clockwise seen from outside
+    uv: np.ndarray  # [P, 2] float32, (0, 0) at the upper left and (1, 1) at the lower right corner, as in glTF
+    texture: np.ndarray  # [S, S, 3] uint8, sRGB
 
     def __post_init__(self) -> None:
         check_shapes(
@@ -88,16 +77,7 @@ class TexturedMesh:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the mesh with its texture to a file: .glb, or .obj with .mtl and .png beside it.
 
-        Parameters
-        ----------
-        path : path
-
-        Raises
-        ------
-        DataError
-            If the name has another suffix.
-        DiskError
-            If a file could not be written.
+        Raises DataError if the name has another suffix, DiskError if a file could not be written.
         """
         import gs2d  # the writers are in a higher layer
 

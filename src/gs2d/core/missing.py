@@ -20,13 +20,7 @@ _SOG = "means_l.webp"  # an image of splats in the SOG format, beside its meta.j
 
 
 def path_hint(path: Path) -> str:
-    """Return a hint on a missing path: "; did you mean scans/chair?" or "; there is no chair in /home/me/scans".
-
-    Parameters
-    ----------
-    path : Path
-        A path that does not exist.
-    """
+    """Return a hint on a missing path: "; did you mean scans/chair?" or "; there is no chair in /home/me/scans"."""
     missing, rest = path, Path()
     while missing.parent != missing and not missing.parent.exists():
         missing, rest = missing.parent, missing.name / rest
@@ -43,15 +37,9 @@ def path_hint(path: Path) -> str:
 
 
 def suggestion(path: Path, needed: str) -> str:
-    """Return a suggestion for an existing path that is not what a command needs; begins with "; ".
+    """Return a suggestion for an existing path that is not the ``needed`` "run", "capture" or "photographs".
 
-    Only file names are examined. RUN in a suggested command is a name that the user chooses.
-
-    Parameters
-    ----------
-    path : Path
-    needed : str
-        "run", "capture" or "photographs".
+    It begins with "; ". Only file names are examined. RUN in a suggested command is a name that the user chooses.
     """
     if path.suffix.lower() == ".zip" and path.is_file():
         folder = path.with_suffix("")

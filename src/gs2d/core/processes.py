@@ -13,20 +13,10 @@ NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 @dataclass(frozen=True)
 class ProcessRank:
-    """Rank of this process among those that train together.
+    """Rank of this process among those that train together; the local rank on this machine selects the GPU."""
 
-    Attributes
-    ----------
-    rank : int
-        Over all machines, from 0. Only rank 0 writes and prints.
-    size : int
-        Number of processes.
-    local_rank, local_size : int
-        Rank and number on this machine; the local rank selects the GPU.
-    """
-
-    rank: int = 0
-    size: int = 1
+    rank: int = 0  # over all machines, from 0; only rank 0 writes and prints
+    size: int = 1  # number of processes
     local_rank: int = 0
     local_size: int = 1
 
@@ -44,10 +34,7 @@ def available_cores() -> int:
 def process_rank(environment: Mapping[str, str] = os.environ) -> ProcessRank:
     """Return the rank of this process; that of a single process if the environment is not complete.
 
-    Raises
-    ------
-    BackendError
-        If the environment is contradictory.
+    Raises BackendError if the environment is contradictory.
     """
     if not all(environment.get(name) for name in NEEDED):
         return ProcessRank()

@@ -26,13 +26,7 @@ def num_coefficients(degree: int) -> int:
 
 
 def sh_degree_of(coefficients: int) -> int:
-    """Return the SH degree with K coefficients.
-
-    Raises
-    ------
-    ShapeError
-        If K is not 1, 4, 9 or 16.
-    """
+    """Return the SH degree with K coefficients; ShapeError if K is not 1, 4, 9 or 16."""
     for degree in range(MAX_DEGREE + 1):
         if num_coefficients(degree) == coefficients:
             return degree
@@ -42,24 +36,10 @@ def sh_degree_of(coefficients: int) -> int:
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Return the values of the first K = (degree + 1)^2 basis functions.
+    """Return the values [N, K] of the first K = (degree + 1)^2 basis functions along unit vectors [N, 3].
 
-    Parameters
-    ----------
-    directions : Tensor [N, 3]
-        Unit vectors.
-    degree : int
-        0 to 3.
-
-    Returns
-    -------
-    Tensor [N, K]
-        Ordered by degree l, then by order m = -l .. l.
-
-    Raises
-    ------
-    ShapeError
-        If the shape or the degree is wrong.
+    They are ordered by degree l, then by order m = -l .. l. Raises ShapeError if the shape is wrong or the degree is
+    not 0 to 3.
     """
     check_shapes({"directions": (directions, "N 3")})
     if not 0 <= degree <= MAX_DEGREE:
@@ -96,26 +76,11 @@ def harmonics(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
 
 
 def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Return the colour of N splats along N directions: SH + 0.5, clamped at 0 (not above 1).
+    """Return the colour [N, 3] of N splats along N directions: SH + 0.5, clamped at 0 (not above 1).
 
-    Parameters
-    ----------
-    sh0 : Tensor [N, 1, 3]
-    shN : Tensor [N, K-1, 3]
-    directions : Tensor [N, 3]
-        Unit vectors from the camera to the splat.
-    degree : int
-        Evaluated degree; higher coefficients are ignored.
-
-    Returns
-    -------
-    Tensor [N, 3]
-        RGB; 0.5 if all coefficients are 0. A clamped channel has zero gradient.
-
-    Raises
-    ------
-    ShapeError
-        If the coefficients do not reach ``degree``.
+    ``sh0`` is [N, 1, 3], ``shN`` [N, K-1, 3], and the unit vectors [N, 3] point from the camera to the splat.
+    Coefficients above ``degree`` are ignored. A clamped channel has zero gradient. Raises ShapeError if the
+    coefficients do not reach ``degree``.
     """
     check_shapes({"sh0": (sh0, "N 1 3"), "shN": (shN, "N _ 3"), "directions": (directions, "N 3")})
     K = num_coefficients(degree)

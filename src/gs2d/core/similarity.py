@@ -16,13 +16,7 @@ def apply(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def similarity_scale(T: np.ndarray, name: str = "T") -> float:
-    """Return the scale of a similarity [4, 4].
-
-    Raises
-    ------
-    DataError
-        If it is mirrored, sheared, or scaled anisotropically.
-    """
+    """Return the scale of a similarity [4, 4]; DataError if it is mirrored, sheared, or scaled anisotropically."""
     check_shapes({name: (T, "4 4")})
     A = T[:3, :3]
     determinant = float(np.linalg.det(A))
@@ -44,15 +38,8 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
 def umeyama(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the similarity [4, 4] with the least sum of |target - T source|^2 over pairs (Umeyama 1991, eq. 39 to 43).
 
-    Parameters
-    ----------
-    source, target : ndarray [P, 3]
-        Row i of one corresponds to row i of the other.
-
-    Raises
-    ------
-    DataError
-        If the rotation is not determined: fewer than three pairs, or points on one line.
+    Rows i of ``source`` and ``target`` [P, 3] correspond. Raises DataError if the rotation is not determined: fewer
+    than three pairs, or points on one line.
     """
     check_shapes({"source": (source, "P 3"), "target": (target, "P 3")})
     if len(source) < 3:

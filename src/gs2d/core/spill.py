@@ -19,12 +19,7 @@ RECENT = 32  # values from the file that are cached: neighbouring views are requ
 class SpillFile:
     """Pickled values in an anonymous file, in the temporary folder (``TMPDIR``); it is deleted with the object.
 
-    Parameters
-    ----------
-    what : str
-        Description of the values in errors.
-    remedies : str
-        Other remedies than free space.
+    Errors describe the values as ``what``, and name ``remedies`` besides free space.
     """
 
     def __init__(
@@ -36,13 +31,7 @@ class SpillFile:
         self._file: IO[bytes] | None = None
 
     def put(self, packed: bytes) -> tuple[int, int]:
-        """Write a pickled value, and return its place in the file.
-
-        Raises
-        ------
-        DiskError
-            If the file cannot be written.
-        """
+        """Write a pickled value, and return its place in the file; DiskError if the file cannot be written."""
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the object
@@ -67,16 +56,7 @@ class SpillFile:
 class Spilled(Sequence[T], Generic[T]):
     """A sequence whose first values stay in memory up to ``limit_bytes``; later ones are in a ``SpillFile``.
 
-    Parameters
-    ----------
-    values : iterable
-        Consumed one by one.
-    limit_bytes : int
-
-    Raises
-    ------
-    DiskError
-        If the file cannot be written.
+    The values are consumed one by one. Raises DiskError if the file cannot be written.
     """
 
     def __init__(self, values: Iterable[T], limit_bytes: int) -> None:

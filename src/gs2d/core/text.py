@@ -24,11 +24,7 @@ def name_bytes(text: str) -> bytes:
 def printable(text: str, *, lines: bool = False) -> str:
     r"""Return text that is safe to print: control characters are escaped, such as ``\x1b``.
 
-    Parameters
-    ----------
-    text : str
-    lines : bool
-        Whether to keep line ends and tabs.
+    With ``lines``, line ends and tabs are kept.
     """
     return (_HIDDEN_IN_LINES if lines else _HIDDEN).sub(_spelled, text)
 

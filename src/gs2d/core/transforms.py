@@ -22,16 +22,9 @@ _SPREAD = 0.02  # smallest mean square spread of the horizontal axes for estimat
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:
-    """Convert quaternions to rotation matrices.
+    """Convert quaternions (w, x, y, z) [N, 4] of any non-zero length to rotation matrices [N, 3, 3].
 
-    Parameters
-    ----------
-    quats : Tensor [N, 4]
-        (w, x, y, z) of any non-zero length. A zero quaternion gives NaN, which the rasterizers cull.
-
-    Returns
-    -------
-    Tensor [N, 3, 3]
+    A zero quaternion gives NaN, which the rasterizers cull.
     """
     check_shapes({"quats": (quats, "N 4")})
     too_long = quats.detach().abs().amax(dim=1, keepdim=True) > 1e15  # its square overflows float32
@@ -46,18 +39,10 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
 
 
 def se3_exp(motion: Tensor) -> Tensor:
-    """Return the rigid motion of a twist: exact, and differentiable at 0 too.
+    """Return the rigid motion [..., 4, 4] of a twist [..., 6]: exact, and differentiable at 0 too.
 
-    Parameters
-    ----------
-    motion : Tensor [..., 6]
-        Rotation vector (axis times angle, rad), then velocity (world units): the motion of a body that rotates and
-        moves at these rates for one unit of time.
-
-    Returns
-    -------
-    Tensor [..., 4, 4]
-        In the dtype and on the device of ``motion``.
+    A twist is a rotation vector (axis times angle, rad), then a velocity (world units): the motion of a body that
+    rotates and moves at these rates for one unit of time.
     """
     if not motion.ndim or motion.shape[-1] != 6:
         raise ShapeError(f"motion must be [..., 6], a rotation vector and a velocity, got {list(motion.shape)}")
@@ -123,20 +108,10 @@ def perturb_pose(camera: Camera | Tensor, motion: Tensor) -> Camera | Tensor:
 
 
 def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
-    """Return the derivative of camera motions by a small similarity of the scene.
+    """Return the derivative [V, 6, 7] of camera motions by a small similarity of the scene.
 
-    Parameters
-    ----------
-    poses : ndarray [V, 4, 4]
-        T_cam_world.
-    extent : float
-        World units.
-
-    Returns
-    -------
-    ndarray [V, 6, 7]
-        Derivative of the motions in camera frames (rad, extents) by the rotation of the scene about the mean camera
-        centre (rad), its translation (extents) and its relative scale.
+    The motions of the cameras with ``poses`` T_cam_world [V, 4, 4] are in camera frames (rad, extents). The similarity
+    is the rotation of the scene about the mean camera centre (rad), its translation (extents) and its relative scale.
     """
     R = poses[:, :3, :3]
     centers = -np.einsum("vji,vj->vi", R, poses[:, :3, 3])
@@ -158,22 +133,10 @@ def common_motion(motions: np.ndarray, by_similarity: np.ndarray) -> np.ndarray:
 
 
 def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
-    """Return the root mean square distance of each point to its k nearest others (initial scale of a splat).
+    """Return the root mean square distance [P] of each point to its k nearest others (initial scale of a splat).
 
-    Parameters
-    ----------
-    points : ndarray [P, 3] world units
-    k : int
-        Number of neighbours, if there are as many.
-
-    Returns
-    -------
-    ndarray [P] float64, world units; 0 for coincident points
-
-    Raises
-    ------
-    ShapeError
-        If there are fewer than two points, k is not positive, or a coordinate is not finite.
+    Points [P, 3] and distances are in world units, float64; coincident points have 0. With fewer than k others all
+    count. Raises ShapeError if there are fewer than two points, k is not positive, or a coordinate is not finite.
     """
     points = np.asarray(points, dtype=np.float64)
     check_shapes({"points": (points, "P 3")})
@@ -187,13 +150,9 @@ def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the point with the least sum of squared distances to the optical axes.
+    """Return the point [3] with the least sum of squared distances to the optical axes, world units.
 
     Where the axes do not determine it (parallel axes, one camera), the point nearest to the mean camera centre is used.
-
-    Returns
-    -------
-    ndarray [3] world units
     """
     centers = np.stack([camera.center for camera in cameras])  # [V, 3]
     axes = np.stack([camera.forward for camera in cameras])
@@ -233,13 +192,9 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
 def camera_outliers(cameras: Sequence[Camera]) -> dict[int, float]:
     """Return cameras with implausible positions, which structure from motion leaves sometimes.
 
-    An outlier is more than ``OUTLIER`` times as far from the median centre as the median camera. If this holds for more
-    than a quarter of the cameras, or most centres coincide, none is an outlier.
-
-    Returns
-    -------
-    dict of int to float
-        Index in ``cameras``, and distance divided by the median distance.
+    They are indices in ``cameras``, with their distance divided by the median distance. An outlier is more than
+    ``OUTLIER`` times as far from the median centre as the median camera. If this holds for more than a quarter of the
+    cameras, or most centres coincide, none is an outlier.
     """
     if len(cameras) < 4:
         return {}

@@ -63,11 +63,7 @@ def arguments_of(function: str, /, **fields: Any) -> ctypes.Structure:
 def structure(name: str, where: str) -> type[ctypes.Structure]:
     """Return a C++ structure by its name; setting a field that it lacks is an error.
 
-    Parameters
-    ----------
-    name : str
-    where : str
-        Folder "cpu" or "cuda", or source file in ``kernels/`` if the name is not unique.
+    ``where`` is the folder "cpu" or "cuda", or a source file in ``kernels/`` if the name is not unique.
     """
     text = source_of(where)
     (members,) = (members for known, members in STRUCTURE.findall(text) if known == name)

@@ -14,20 +14,10 @@ def accumulate(
 ) -> None:
     """Add the norms of the signal of visible splats, and count these splats.
 
-    Parameters
-    ----------
-    signed, absolute, count : Tensor [N]
-        Contiguous; changed in place. ``absolute`` only if the signal has four columns.
-    signal : Tensor [N, 2] or [N, 4]
-        Gradient of the screen probe: signed in columns 0:2, absolute in 2:4.
-    radii : Tensor [N] px
-        Splats with radius 0 are skipped.
-    library : Library, optional
-
-    Raises
-    ------
-    ShapeError
-        If shapes differ, or a tensor has another dtype or device than the library.
+    ``signed``, ``absolute`` and ``count`` [N] are contiguous and changed in place, ``absolute`` only if the signal has
+    four columns. ``signal`` [N, 2] or [N, 4] is the gradient of the screen probe: signed in columns 0:2, absolute in
+    2:4. Splats with radius 0 are skipped. Raises ShapeError if shapes differ, or a tensor has another dtype or device
+    than the library.
     """
     library = library or ready_library()
     columns = 4 if signal.dim() == 2 and signal.shape[1] == 4 else 2

@@ -32,19 +32,7 @@ REMEDY = (
 
 
 class Library:
-    """One loaded native library.
-
-    Attributes
-    ----------
-    variant : str
-        ``"v4"``, ``"v3"``, ``"portable"``, or ``"f64"`` (all arithmetic in float64; tests only).
-    dtype : torch.dtype
-        dtype of the arrays that its functions take.
-    lanes : int
-        Pixels per vector.
-    pool : BufferPool
-        Allocates large results.
-    """
+    """One loaded native library."""
 
     def __init__(self, path: Path, variant: str) -> None:
         try:
@@ -55,10 +43,11 @@ class Library:
         if version != ABI_VERSION:
             raise BackendError(f"the CPU kernels {path.name} have version {version}, expected {ABI_VERSION}; {REMEDY}")
         self.path = path
-        self.variant = variant
-        self.pool = BufferPool()
+        self.variant = variant  # "v4", "v3", "portable", or "f64" (all arithmetic in float64; tests only)
+        self.pool = BufferPool()  # allocates large results
         self._functions: dict[str, Any] = {}
-        self.lanes = int(self._dll.gs2d_lanes())
+        self.lanes = int(self._dll.gs2d_lanes())  # pixels per vector
+        # Of the arrays that its functions take.
         self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32
 
     def call(self, name: str, /, *arguments: Any, **fields: Any) -> Any:
@@ -83,10 +72,7 @@ class Library:
     def arrays(self, **tensors: torch.Tensor | None) -> list[Any]:
         """Return the tensors, detached and contiguous, in the order of the arguments; None stays None.
 
-        Raises
-        ------
-        ShapeError
-            If a tensor is not on the CPU or has another dtype than the library.
+        Raises ShapeError if a tensor is not on the CPU or has another dtype than the library.
         """
         for name, tensor in tensors.items():
             if tensor is not None and (not tensor.is_cpu or tensor.dtype != self.dtype):
@@ -141,16 +127,9 @@ def _load(variant: str) -> Library:
 def load(variant: str | None = None) -> Library:
     """Return the native library: the named variant, or the best one for this machine.
 
-    Parameters
-    ----------
-    variant : str, optional
-        One of ``available_variants()``, or ``"f64"``. Without it, ``GS2D_CPU_VARIANT`` from the environment decides,
-        and without that the processor.
-
-    Raises
-    ------
-    BackendError
-        If the library was not built, or the named variant cannot run here.
+    Variants are those of ``available_variants()`` and ``"f64"``. Without one, ``GS2D_CPU_VARIANT`` from the environment
+    decides, and without that the processor. Raises BackendError if the library was not built, or the variant cannot run
+    here.
     """
     return _choose(FOLDER, variant or os.environ.get("GS2D_CPU_VARIANT"))
 

@@ -19,42 +19,22 @@ from gs2d.errors import ShapeError
 
 @dataclass(frozen=True, eq=False)
 class NormalOptions:
-    """Inputs and options of normal consistency.
-
-    Attributes
-    ----------
-    camera : Camera
-    mask : Tensor [H, W] bool or None
-        False = ignore this pixel.
-    weights : Tensor [H, W] or None
-        Constant weight of each pixel.
-    at_camera : bool
-        Whether empty pixels lie at the camera centre: ``edges`` of ``losses.formulas.normals_from_depth``.
-    per_splat : bool
-        Use the paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
-    """
+    """Inputs and options of normal consistency."""
 
     camera: Camera
-    mask: Tensor | None = None
-    weights: Tensor | None = None
+    mask: Tensor | None = None  # [H, W] bool, False = ignore this pixel
+    weights: Tensor | None = None  # [H, W], constant
+    # Whether empty pixels lie at the camera centre: ``edges`` of ``losses.formulas.normals_from_depth``.
     at_camera: bool = False
-    per_splat: bool = False
+    per_splat: bool = False  # the paper's mean(alpha - <n, N>), not the official mean(1 - alpha <n, N>), alpha detached
 
 
 class LossOperations:
     """The fused losses of a processor, differentiable, with values that do not depend on the number of threads.
 
     All of them raise ShapeError if shapes differ, or if a tensor has another dtype or device than the processor needs.
-
-    Parameters
-    ----------
-    engine : object
-        Library or launcher; the last argument of the functions.
-
-    Attributes
-    ----------
-    functions : tuple of torch.autograd.Function
-        Photometric, normal consistency, normal smoothness and masked mean. Their arguments are contiguous and checked.
+    ``functions`` are the torch.autograd.Functions of photometric losses, normal consistency, normal smoothness and
+    masked mean; their arguments are contiguous and checked, and the last one is the engine, a library or launcher.
     """
 
     functions: ClassVar[tuple[Any, Any, Any, Any]]
@@ -82,21 +62,10 @@ class LossOperations:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return mean L1, SSIM and L2 of an image, all differentiable in ``rendered``, in one fused pass.
 
-        Parameters
-        ----------
-        rendered, target : Tensor [H, W, 3]
-            In [0, 1].
-        mask : Tensor [H, W] bool, optional
-            False = ignore this pixel.
-        target_mean : Tensor [H, W, 3], optional
-            ``blur(target)``, to save time. Changes no bit of the result.
-        expected : (float, float, float)
-            Expected cotangents of the three values; others may cost a second pass.
-
-        Returns
-        -------
-        l1, ssim, l2 : Tensor []
-            Means over valid pixels and channels; 0 if no pixel is valid. L2 is the mean squared difference.
+        Images are [H, W, 3] in [0, 1]; ``mask`` [H, W] bool, False = ignore this pixel. ``target_mean`` is
+        ``blur(target)``, which saves time and changes no bit of the result. ``expected`` are the expected cotangents of
+        the three values; others may cost a second pass. The values [] are means over valid pixels and channels, 0 if no
+        pixel is valid; L2 is the mean squared difference.
         """
         shapes = {"target": (target, "H W 3"), "rendered": (rendered, "H W 3")}
         shapes |= {} if target_mean is None else {"target_mean": (target_mean, "H W 3")}
@@ -111,16 +80,8 @@ class LossOperations:
     ) -> Tensor:
         """Return the normal consistency loss []: the functions of that name in ``losses.formulas``.
 
-        Parameters
-        ----------
-        normal : Tensor [H, W, 3]
-            sum w n, world frame.
-        depth : Tensor [H, W] world units
-            0 where nothing was hit.
-        alpha : Tensor [H, W]
-        how : NormalOptions
-        expected : float
-            Expected cotangent; another one may cost a multiplication of the gradients.
+        ``normal`` [H, W, 3] is sum w n in the world frame, ``depth`` [H, W] is in world units, 0 where nothing was hit.
+        Another cotangent than ``expected`` may cost a multiplication of the gradients.
         """
         shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
         shapes |= {} if how.mask is None else {"mask": (how.mask, "H W")}
@@ -138,19 +99,9 @@ class LossOperations:
     def normal_smoothness(
         self, normal: Tensor, alpha: Tensor, flatness: Tensor, mask: Tensor | None = None, *, expected: float = 1.0
     ) -> Tensor:
-        """Return the normal smoothness loss []: ``losses.formulas.normal_smoothness``.
+        """Return the normal smoothness loss []: ``losses.formulas.normal_smoothness`` has the shapes.
 
-        Parameters
-        ----------
-        normal : Tensor [H, W, 3]
-            sum w n, world frame.
-        alpha : Tensor [H, W]
-            A constant.
-        flatness : Tensor [H, W] uint8
-        mask : Tensor [H, W] bool, optional
-            False = ignore this pixel.
-        expected : float
-            Expected cotangent; another one may cost a multiplication of the gradient.
+        Another cotangent than ``expected`` may cost a multiplication of the gradient.
         """
         shapes = {"normal": (normal, "H W 3"), "alpha": (alpha, "H W"), "flatness": (flatness, "H W")}
         check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))

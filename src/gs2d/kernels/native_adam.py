@@ -19,20 +19,8 @@ from gs2d.kernels.library import Library, ready_library
 class AdamUpdate:
     """The update of one attribute in an Adam step.
 
-    Attributes
-    ----------
-    parameter, mean, square : Tensor [N, ...] float32
-        Contiguous; changed in place.
-    gradient : Tensor
-        Same shape as the parameter; with ``compact``, one row for each of ``rows``.
-    rate : float
-    step : float
-        Step number for the bias correction, 1 in the first step; fractional if steps had different lengths.
-    trained : Tensor [N] bool, optional
-        Rows that are False are not written, and their gradients are not read.
-    rows : Tensor [M] int64, optional
-        Updates only these rows, each once; instead of ``trained``.
-    compact : bool
+    ``parameter``, ``mean`` and ``square`` [N, ...] float32 are contiguous and changed in place. The gradient has their
+    shape; if it is ``compact``, it has one row for each of ``rows``.
     """
 
     parameter: Tensor
@@ -40,9 +28,9 @@ class AdamUpdate:
     square: Tensor
     gradient: Tensor
     rate: float
-    step: float
-    trained: Tensor | None = None
-    rows: Tensor | None = None
+    step: float  # number for the bias correction, 1 in the first step; fractional if steps had different lengths
+    trained: Tensor | None = None  # [N] bool; rows that are False are not written, and their gradients are not read
+    rows: Tensor | None = None  # [M] int64, updates only these, each once; instead of ``trained``
     compact: bool = False
 
 
@@ -81,18 +69,8 @@ def adam_step(
 ) -> None:
     """Run one Adam step on several attributes, in place; equal to torch's fused Adam to rounding.
 
-    Parameters
-    ----------
-    updates : sequence of AdamUpdate
-        Tensors with the library's dtype on the CPU.
-    beta1, beta2, eps : float
-    library : Library, optional
-        Default: :func:`ready_library`. The bits do not depend on the number of threads.
-
-    Raises
-    ------
-    ShapeError
-        If a tensor has another shape, dtype or device, or a row index is out of range.
+    Tensors are on the CPU and have the library's dtype. The bits do not depend on the number of threads. Raises
+    ShapeError if a tensor has another shape, dtype or device, or a row index is out of range.
     """
     library = library or ready_library()
     attributes = (structure("AdamAttribute", "cpu") * len(updates))()
@@ -121,10 +99,7 @@ def adam_step(
 def first_not_finite(tensors: Sequence[Tensor], *, library: Library | None = None) -> int | None:
     """Return the index of the first tensor with a NaN or an infinity, None if all are finite.
 
-    Raises
-    ------
-    ShapeError
-        If a tensor is not on the CPU or has another dtype than the library.
+    Raises ShapeError if a tensor is not on the CPU or has another dtype than the library.
     """
     library = library or ready_library()
     plain = library.arrays(**{f"tensor {number}": tensor for number, tensor in enumerate(tensors)})

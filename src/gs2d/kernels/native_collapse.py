@@ -13,54 +13,28 @@ _CANDIDATE_BYTES = 24  # of cpu/collapse.cpp
 
 
 class CollapseRules(NamedTuple):
-    """Where a collapse ends and what it costs; the weights are those of ``meshing/simplify.py``.
+    """Where a collapse ends and what it costs; the weights are those of ``meshing/simplify.py``."""
 
-    Attributes
-    ----------
-    target : int
-        Stop at this number of faces.
-    limit : float, px^2
-        Largest cost.
-    length_weight, tint_weight : float
-        Squares of ``LENGTH`` and ``TINT``.
-    border_weight, turn, pull : float
-        ``BORDER``, ``TURN`` and ``PULL``.
-    """
-
-    target: int
-    limit: float
-    length_weight: float
-    tint_weight: float
-    border_weight: float
-    turn: float
-    pull: float
+    target: int  # stop at this number of faces
+    limit: float  # largest cost, px^2
+    length_weight: float  # square of ``LENGTH``
+    tint_weight: float  # square of ``TINT``
+    border_weight: float  # ``BORDER``
+    turn: float  # ``TURN``
+    pull: float  # ``PULL``
 
 
 @dataclass(frozen=True, eq=False)
 class CollapseArrays:
-    """A mesh and the sums of its vertices, changed in place.
+    """A mesh and the sums of its vertices, changed in place."""
 
-    Attributes
-    ----------
-    points : ndarray [P, 3] float64
-    scale : ndarray [P] float64
-        Pixels per unit of length.
-    colors : ndarray [P, 3] float64 or None
-        In [0, 1].
-    corners : ndarray [F, 3] int32
-        The first corner of a removed face becomes -1.
-    quadric : ndarray [P, 12] float64
-        A (6), b (3) and c of the sum of a s^2 (n.x + d)^2; then the sums of a and of a s^2.
-    color : ndarray [P, 4] float64
-        Sums of a times the colour (3) and of a times its square.
-    """
-
-    points: np.ndarray
-    scale: np.ndarray
-    colors: np.ndarray | None
-    corners: np.ndarray
+    points: np.ndarray  # [P, 3] float64
+    scale: np.ndarray  # [P] float64, pixels per unit of length
+    colors: np.ndarray | None  # [P, 3] float64 in [0, 1]
+    corners: np.ndarray  # [F, 3] int32; the first corner of a removed face becomes -1
+    # [P, 12] float64: A (6), b (3), c of the sum of a s^2 (n.x + d)^2; then the sums of a and of a s^2.
     quadric: np.ndarray
-    color: np.ndarray
+    color: np.ndarray  # [P, 4] float64, sums of a times the colour (3) and of a times its square
 
     @classmethod
     def of(cls, points: np.ndarray, faces: np.ndarray, scale: np.ndarray, colors: np.ndarray | None) -> CollapseArrays:

@@ -11,47 +11,22 @@ from gs2d.kernels.library import library_for
 
 
 class SeenSpace(NamedTuple):
-    """Free space and surface depth of one image.
+    """Free space and surface depth of one image; lengths in world units."""
 
-    Attributes
-    ----------
-    project : Tensor [3, 4] float32
-        Projects a point p to pixel (x, y) and depth z: (x z, y z, z) = project (p, 1).
-    center : Tensor [3] float32
-        Camera centre, world units.
-    limit, known : Tensor [H, W] float32, world units
-        Points nearer than ``limit`` are in free space; ``known`` is the depth of the surface, or infinite.
-    radius : float
-        Radius of the free ball around the camera, world units.
-    fraction : float
-        A centre is on the surface if its depth differs by at most this fraction.
-    """
-
-    project: Tensor
-    center: Tensor
-    limit: Tensor
-    known: Tensor
-    radius: float
-    fraction: float
+    project: Tensor  # [3, 4] float32, a point p to pixel (x, y) and depth z: (x z, y z, z) = project (p, 1)
+    center: Tensor  # [3] float32, camera centre
+    limit: Tensor  # [H, W] float32; nearer points are in free space
+    known: Tensor  # [H, W] float32, depth of the surface, or infinite
+    radius: float  # of the free ball around the camera
+    fraction: float  # a centre is on the surface if its depth differs by at most this fraction
 
 
 def look_at_free_space(ends: Tensor, reach: Tensor, seen: SeenSpace, against: Tensor, support: Tensor) -> bool:
     """Count for each splat whether an image sees through it, and whether the image shows a surface at its centre.
 
-    Parameters
-    ----------
-    ends : Tensor [P, N, 3] float32, world units
-        Sample points of each splat, its centre first.
-    reach : Tensor [N] float32, world units
-        Largest distance of a sample point from the centre.
-    seen : SeenSpace
-    against, support : Tensor [N] int32
-        Incremented where any sample point is in free space, and where the centre is on the surface.
-
-    Returns
-    -------
-    bool
-        False without the native library; nothing is done then.
+    ``ends`` [P, N, 3] float32 are sample points of each splat, its centre first; ``reach`` [N] float32 is their largest
+    distance from the centre, world units. ``against`` and ``support`` [N] int32 are incremented where any sample point
+    is in free space, and where the centre is on the surface. Returns False and does nothing without the native library.
     """
     library = library_for(ends)
     if library is None or library.dtype != torch.float32:

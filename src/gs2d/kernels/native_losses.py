@@ -151,13 +151,7 @@ class _MaskedMean(torch.autograd.Function):
 
 
 class NativeLosses(LossOperations):
-    """The losses of a native library.
-
-    Parameters
-    ----------
-    library : Library, optional
-        Default: :func:`ready_library`.
-    """
+    """The losses of a native library, by default :func:`ready_library`."""
 
     functions = (_Photometric, _NormalConsistency, _NormalSmoothness, _MaskedMean)
 

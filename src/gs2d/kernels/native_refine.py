@@ -28,14 +28,8 @@ def draw_on_cpu(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw a mesh; return the nearest face [H, W] and its depth [H, W].
 
-    Parameters
-    ----------
-    library : Library
-    vertices : ndarray [P, 3] float64 world units
-    faces : ndarray [F, 3] int32
-    camera : Camera
-    near : float, world units
-        Faces with a vertex nearer than this are left out.
+    ``vertices`` are [P, 3] float64, world units, ``faces`` [F, 3] int32. Faces with a vertex nearer than ``near`` are
+    left out.
     """
     vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)
     size = (camera.height, camera.width)
@@ -54,12 +48,6 @@ def gather_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
 
 
 def match_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
-    """Add the derivatives of one comparison to the pixels.
-
-    Raises
-    ------
-    MemoryError
-        If the rows of a window do not fit into memory.
-    """
+    """Add the derivatives of one comparison to the pixels; MemoryError if the rows of a window do not fit."""
     if library.call("gs2d_match_views", arguments) != 0:
         raise MemoryError("gs2d_match_views could not allocate its rows")

@@ -14,21 +14,11 @@ from gs2d.kernels.library import library_for
 
 @dataclass(frozen=True, eq=False)
 class BestPlanes:
-    """Result of a plane sweep.
+    """Result of a plane sweep, [H, W] each."""
 
-    Attributes
-    ----------
-    score : Tensor [H, W]
-        Score of the best plane: mean NCC with the two images that agree best.
-    plane : Tensor [H, W] int64
-        Index of the best plane.
-    before, after : Tensor [H, W]
-        Scores of the adjacent planes; undefined at the first and the last plane.
-    """
-
-    score: Tensor
-    plane: Tensor
-    before: Tensor
+    score: Tensor  # of the best plane: mean NCC with the two images that agree best
+    plane: Tensor  # int64, index of the best plane
+    before: Tensor  # with ``after`` scores of the adjacent planes; undefined at the first and the last plane
     after: Tensor
 
 
@@ -43,22 +33,13 @@ def sweep_planes(
     radius: int,
     noise: float,
 ) -> BestPlanes | None:
-    """Find the best plane of each pixel of a grey image; None without the native library.
+    """Find the best plane of each pixel of a grey image [H, W] float32; None without the native library.
 
-    Parameters
-    ----------
-    image : Tensor [H, W] float32
-    wanted : Tensor [H, W] bool
-        Pixels to sweep; the score of other pixels may be -1.
-    others : sequence of n Tensor [h, w] float32
-        Other images, each of its own size.
-    turned, moved : Tensor [n, 3, 3], [n, 3] float32
-        Another image shows pixel (x, y, 1) at depth z at ``z turned (x, y, 1) + moved``, homogeneous.
-    depths : Tensor [D] float32, world units
-    radius : int
-        Patches have 2 radius + 1 pixels per side; images are mirrored at their edges.
-    noise : float
-        Variance of image noise, added to both variances of the NCC.
+    Pixels that are not ``wanted`` [H, W] bool may have the score -1. Each of the n other images [h, w] float32 has its
+    own size; it shows pixel (x, y, 1) at depth z at ``z turned (x, y, 1) + moved``, homogeneous, with ``turned`` [n, 3,
+    3] and ``moved`` [n, 3] float32. ``depths`` [D] float32 are in world units. Patches have 2 ``radius`` + 1 pixels per
+    side; images are mirrored at their edges. ``noise`` is the variance of image noise, added to both variances of the
+    NCC.
     """
     library = library_for(image)
     if library is None or library.dtype != torch.float32:

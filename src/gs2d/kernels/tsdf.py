@@ -44,21 +44,10 @@ def mark_on_cpu(
 ) -> None:
     """Mark the blocks of the grid near the samples ``start + (depth + offset) rays``.
 
-    All positions are in halves of a block.
-
-    Parameters
-    ----------
-    library : Library
-    rays : ndarray [3, P] float64
-        Ray directions, per world unit of depth.
-    depth : ndarray [P] float64 world units
-    offsets : ndarray [S] float64 world units
-    start : ndarray [3]
-        Origin of the rays.
-    end : ndarray [3]
-        End of the grid, which begins at 0.
-    marks : ndarray [X, Y, Z] bool
-        Includes a border of one block on all sides; changed in place.
+    All positions are in halves of a block. ``rays`` [3, P] are float64 directions per world unit of depth, ``depth``
+    [P] and ``offsets`` [S] float64 world units, ``start`` [3] is the origin of the rays and ``end`` [3] the end of the
+    grid, which begins at 0. ``marks`` [X, Y, Z] bool includes a border of one block on all sides and is changed in
+    place.
     """
     rays, depth, offsets = (np.ascontiguousarray(a, np.float64) for a in (rays, depth, offsets))
     arrays = {"rays": rays, "depth": depth, "offsets": offsets, "marks": marks}
@@ -88,13 +77,7 @@ def arguments_of(
 
 
 def fuse_on_cpu(library: Library, arguments: ctypes.Structure) -> None:
-    """Fuse the depth map, with the library's number of threads.
-
-    Raises
-    ------
-    BackendError
-        If the library computes in float64.
-    """
+    """Fuse the depth map, with the library's number of threads; BackendError if the library computes in float64."""
     if library.dtype.itemsize != 4:
         raise BackendError(
             f"depth maps are fused in float32, got the {library.variant} kernels; unset GS2D_CPU_VARIANT"

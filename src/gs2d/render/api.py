@@ -181,17 +181,8 @@ def rasterize_features(
 ) -> RenderOutput:
     """Render splats with further plain channels: :func:`rasterize` with a colour image [H, W, 3 + F].
 
-    Rules 16 and 23 include these channels: a splat is culled if a channel is not finite or their absolute values sum to
-    more than 1e15.
-
-    Parameters
-    ----------
-    splats, camera, screen_probe
-        As for :func:`rasterize`.
-    settings : RasterSettings
-        With ``sh_degree`` -1 and without depth by transmittance.
-    features : Features
-    backend : Backend
+    The settings have ``sh_degree`` -1 and no depth by transmittance. Rules 16 and 23 include these channels: a splat is
+    culled if a channel is not finite or their absolute values sum to more than 1e15.
     """
     _check_types(splats, camera, settings, screen_probe=screen_probe)
     settings, camera = _checked_view(splats, camera, settings, backend, screen_probe)

@@ -67,25 +67,13 @@ def register_backend(name: str) -> Callable[[Register], Register]:
 
 @dataclass(frozen=True)
 class BackendStatus:
-    """One line of ``gs2d doctor``.
-
-    Attributes
-    ----------
-    name : str
-    available : bool
-    reason : str
-        Why the backend cannot run; "" if it can.
-    remedy : str
-        How to make it available; "" if it can run.
-    details : str
-        Instruction set, version, device.
-    """
+    """One line of ``gs2d doctor``."""
 
     name: str
     available: bool
-    reason: str
-    remedy: str
-    details: str
+    reason: str  # why the backend cannot run; "" if it can
+    remedy: str  # how to make it available; "" if it can run
+    details: str  # instruction set, version, device
 
 
 class Backend:
@@ -97,28 +85,14 @@ class Backend:
     Training calls :meth:`iterate`. An iteration changes tensors only by :meth:`adam_step`, :meth:`accumulate` and
     :meth:`assign`. An asynchronous backend may learn later that an image was incomplete: these methods then have
     changed nothing, and the backend repeats the iteration before the next one.
-
-    Attributes
-    ----------
-    name : str
-    device : str
-        Device for the tensors of training, scoring and meshing.
-    lowpass_depths : tuple of str
-        Supported values of ``RasterSettings.lowpass_depth``.
-    caches_views : bool
-        Whether :meth:`cache_view` is implemented.
-    slow : bool
-        Whether users who did not choose this backend get a warning.
-    about : str
-        Details for ``gs2d doctor``.
     """
 
     name: str = ""
-    device: str = "cpu"
-    lowpass_depths: tuple[str, ...] = ("center",)
-    caches_views: bool = False
-    slow: bool = False
-    about: str = ""
+    device: str = "cpu"  # for the tensors of training, scoring and meshing
+    lowpass_depths: tuple[str, ...] = ("center",)  # supported values of ``RasterSettings.lowpass_depth``
+    caches_views: bool = False  # whether :meth:`cache_view` is implemented
+    slow: bool = False  # whether users who did not choose this backend get a warning
+    about: str = ""  # details for ``gs2d doctor``
 
     @property
     def on_host(self) -> bool:
@@ -127,13 +101,7 @@ class Backend:
 
     @classmethod
     def ready(cls) -> Self:
-        """Return a backend that can run here.
-
-        Raises
-        ------
-        BackendError
-            With the reason and the remedy, separated by "; ".
-        """
+        """Return a backend that can run here; raise BackendError with the reason and the remedy, separated by "; "."""
         return cls()
 
     # -- rendering ---------------------------------------------------------------------------------------------------
@@ -212,14 +180,9 @@ class Backend:
     def iterate(self, update: Callable[[], T], *, rollback: Callable[[], None], exact: bool) -> T:
         """Run an iteration; first repeat the previous one if it has changed nothing.
 
-        Parameters
-        ----------
-        update : callable
-            Renders, and changes tensors only by methods of this backend.
-        rollback : callable
-            Undoes what ``update`` has counted on the host, before ``update`` is repeated.
-        exact : bool
-            Whether the iteration must be complete when this method returns, since the caller reads its results.
+        ``update`` renders, and changes tensors only by methods of this backend. ``rollback`` undoes what ``update`` has
+        counted on the host, before ``update`` is repeated. ``exact``: whether the iteration must be complete when this
+        method returns, since the caller reads its results.
         """
         return update()
 

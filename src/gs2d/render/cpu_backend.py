@@ -39,17 +39,9 @@ from gs2d.render.types import Features, RasterSettings
 class CpuBackend(KernelBackend):
     """The native library: SIMD and threads. Bit-identical for any number of threads on one machine and version.
 
-    Parameters
-    ----------
-    chosen : Library, optional
-        Renders with this variant and its dtype and number of threads (tests).
-    exact_masks : bool
-        False disables culling inside tiles, and of splats without an ellipse; no bit of the image changes (tests).
-
-    Raises
-    ------
-    BackendError
-        If the library was not built or cannot be loaded.
+    For tests: ``chosen`` renders with this variant and its dtype and number of threads, and ``exact_masks=False``
+    disables culling inside tiles, and of splats without an ellipse, which changes no bit of the image. Raises
+    BackendError if the library was not built or cannot be loaded.
     """
 
     name = "cpu"

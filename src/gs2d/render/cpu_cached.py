@@ -28,15 +28,9 @@ TILE, SH_MAX = 16, 16  # px per side of a tile; basis functions of degree 3 (ker
 
 
 class CachedView:
-    """One view of splats of which only the colours of some rows change.
+    """One view of splats of which only the colours of ``rows`` splats change.
 
-    Attributes
-    ----------
-    arrays : dict of name to Tensor
-        Arrays of ``struct CachedView``; their layout depends on the library's instruction set.
-    height, width : int
-    rows : int
-        M, the number of splats whose colours change.
+    ``arrays`` are those of ``struct CachedView``; their layout depends on the library's instruction set.
     """
 
     def __init__(
@@ -55,17 +49,9 @@ class CachedView:
         return sum(array.nbytes for array in self.arrays.values())
 
     def render(self, sh0: Tensor, shN: Tensor) -> Tensor:
-        """Return the image [H, W, 3], differentiable in the rows' coefficients.
+        """Return the image [H, W, 3], differentiable in the rows' coefficients sh0 [M, 1, 3] and shN [M, K - 1, 3].
 
-        Parameters
-        ----------
-        sh0 : Tensor [M, 1, 3]
-        shN : Tensor [M, K - 1, 3]
-
-        Raises
-        ------
-        ShapeError
-            If the number of rows or coefficients or the dtype differ from the cached ones.
+        Raises ShapeError if the number of rows or coefficients or the dtype differ from the cached ones.
         """
         check_shapes({"sh0": (sh0, "M 1 3"), "shN": (shN, "M K 3")})
         degree = int(self.native.degree)
@@ -111,23 +97,10 @@ def cache_view(
     rows: Tensor,
     limit_bytes: int,
 ) -> CachedView | None:
-    """Cache one view of splats of which only the colours of ``rows`` change.
+    """Cache one view of N splats of which only the colours of ``rows`` [M] int64, each once, change.
 
-    Parameters
-    ----------
-    library : Library
-    camera : Camera
-    settings : RasterSettings
-    splats : mapping of str to Tensor
-        The contiguous parameters of N splats by name; the colours of ``rows`` do not matter.
-    rows : Tensor [M] int64
-        Rows whose colours change, each once.
-    limit_bytes : int
-
-    Returns
-    -------
-    CachedView or None
-        None if it exceeds ``limit_bytes``; its size depends only on the arguments.
+    ``splats`` are the contiguous parameters by name; the colours of ``rows`` do not matter. Returns None if the view
+    exceeds ``limit_bytes``; its size depends only on the arguments.
     """
     if settings.sh_degree < 0:
         raise ShapeError("a cached view needs colours from harmonics, got plain colours (sh_degree -1)")

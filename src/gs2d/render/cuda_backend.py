@@ -44,19 +44,12 @@ class CudaBackend(KernelBackend):
 
     Training does not wait for the device: instead of reading the number of pairs of splat and tile, a rendering
     reserves memory for a quarter more than the largest number so far (:class:`PairBudget`). An iteration that needed
-    more changes nothing and is repeated.
+    more changes nothing and is repeated. Without a ``budget`` each rendering waits for its number of pairs.
 
-    Parameters
-    ----------
-    budget : PairBudget, optional
-        None: each rendering waits for its number of pairs.
-    launcher : Launcher, optional
-        Runs the kernels; default: that of the tensors' device.
-    exact_masks : bool
-        False disables culling inside tiles; no bit of the image may change (tests).
-    deterministic : bool, optional
-        The same gradients bit for bit from run to run. Costs one more pass and 320 bytes for each pair of splat and
-        tile, and 16 more bytes for each further channel. None: as torch.use_deterministic_algorithms says.
+    The ``launcher`` runs the kernels; by default it is that of the tensors' device. ``exact_masks=False`` disables
+    culling inside tiles, which changes no bit of the image (tests). ``deterministic`` gives the same gradients bit for
+    bit from run to run, for one more pass and 320 bytes for each pair of splat and tile, and 16 more bytes for each
+    further channel; None: as torch.use_deterministic_algorithms says.
     """
 
     name = "cuda"

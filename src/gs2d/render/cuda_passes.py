@@ -58,50 +58,22 @@ PROJECTED = {
 
 @dataclass(frozen=True, eq=False)
 class ForwardState:
-    """State of a forward pass for the backward pass.
+    """State of a forward pass for the backward pass."""
 
-    Attributes
-    ----------
-    view : ctypes.Structure
-        ``View`` of common.h.
-    records : Tensor [N, 16] float32
-        Screen records; undefined for splats without tiles.
-    tile_counts : Tensor [N] int32
-        Number of tiles in each splat's rectangle; 0 = not drawn.
-    entries : Tensor [M] int32
-        splat << 8 | mask of sub-blocks, tile by tile, front to back.
-    ranges : Tensor [tiles + 1, 2] int64
-        Each tile's range of ``entries``.
-    tiles : Tensor [tiles] int32
-        Tiles in the order of processing: most entries first.
-    pieces : Tensor [words] float32
-        Memory of the pieces of long lists.
-    seen : Tensor [words, 8] int32
-        Whether a live pixel of a sub-block uses an entry, one bit each.
-    images : dict of Tensor
-        The output images, ``final_T`` [H, W], ``moments`` [H, W, 3], ``depth_transmittance`` and ``slope`` [H, W].
-    radii : Tensor [N] float32
-    order : Tensor [N] int64
-        Splats by depth.
-    ends : Tensor [N] int64
-        Running sum, in that order, of the pairs of splat and tile.
-    permutation : Tensor [M] int64
-        Index of each entry's pair before the sort by tile.
-    """
-
-    view: ctypes.Structure
-    records: Tensor
-    tile_counts: Tensor
-    entries: Tensor
-    ranges: Tensor
-    tiles: Tensor
-    pieces: Tensor
-    seen: Tensor
+    view: ctypes.Structure  # ``View`` of common.h
+    records: Tensor  # [N, 16] float32 screen records; undefined for splats without tiles
+    tile_counts: Tensor  # [N] int32, tiles in each splat's rectangle; 0 = not drawn
+    entries: Tensor  # [M] int32, splat << 8 | mask of sub-blocks, tile by tile, front to back
+    ranges: Tensor  # [tiles + 1, 2] int64, each tile's range of ``entries``
+    tiles: Tensor  # [tiles] int32, in the order of processing: most entries first
+    pieces: Tensor  # [words] float32, memory of the pieces of long lists
+    seen: Tensor  # [words, 8] int32, one bit each: whether a live pixel of a sub-block uses an entry
+    # Outputs, ``final_T`` [H, W], ``moments`` [H, W, 3], ``depth_transmittance`` and ``slope`` [H, W].
     images: dict[str, Tensor]
-    radii: Tensor
-    order: Tensor
-    ends: Tensor
-    permutation: Tensor
+    radii: Tensor  # [N] float32
+    order: Tensor  # [N] int64, splats by depth
+    ends: Tensor  # [N] int64, running sum, in that order, of the pairs of splat and tile
+    permutation: Tensor  # [M] int64, index of each entry's pair before the sort by tile
 
     @property
     def lists(self) -> dict[str, Tensor]:
@@ -274,22 +246,13 @@ def backward(
 ) -> None:
     """Compute gradients.
 
-    Parameters
-    ----------
-    launcher, frame, splats
-        Of the forward pass.
-    upstream : mapping of str to Tensor or None
-        Gradients of the images by name.
-    wanted : mapping of str to Tensor or None
-        Output tensors by name of the parameter, "probe" and "intrinsics" [N, 4]; None is not computed.
-    learns : Tensor [N] bool, optional
-        Splats with gradients; all others get zeros.
-    deterministic : bool
-        Sum without atomics: 320 bytes for each pair of splat and tile, and one more pass.
-    features : sequence of Tensor, optional
-        The values [N, F], background [F] and images [F, H, W] of further channels, the gradients of these images, and
-        zeros [N, F] for the gradients of the values. They exclude ``learns`` and a gradient of the depth by
-        transmittance.
+    ``upstream`` are the gradients of the images by name. ``wanted`` are the output tensors by name of the parameter,
+    "probe" and "intrinsics" [N, 4]; None is not computed. Splats outside of ``learns`` [N] bool get zeros.
+    ``deterministic`` sums without atomics: 320 bytes for each pair of splat and tile, and one more pass.
+
+    ``features`` are the values [N, F], background [F] and images [F, H, W] of further channels, the gradients of these
+    images, and zeros [N, F] for the gradients of the values. They exclude ``learns`` and a gradient of the depth by
+    transmittance.
     """
     if len(splats["means"]) == 0:
         return

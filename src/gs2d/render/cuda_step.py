@@ -56,16 +56,10 @@ MOST_PLANS = 8  # image sizes whose arguments stay filled
 
 
 class Arena:
-    """Persistent memory: flat tensors by name, which grow and are only freed together.
-
-    Attributes
-    ----------
-    generation : int
-        Incremented when a tensor moves, which invalidates addresses.
-    """
+    """Persistent memory: flat tensors by name, which grow and are only freed together."""
 
     def __init__(self, device: torch.device) -> None:
-        self.generation = 0
+        self.generation = 0  # incremented when a tensor moves, which invalidates addresses
         self._device = device
         self._held: dict[str, Tensor] = {}
 
@@ -91,13 +85,7 @@ class Arena:
 
 
 class Stepper:
-    """Runs iterations of one training.
-
-    Parameters
-    ----------
-    launcher : Launcher
-    device : torch.device
-    """
+    """Runs iterations of one training."""
 
     def __init__(self, launcher: Launcher, device: torch.device) -> None:
         self._launcher, self._device = launcher, device
@@ -189,38 +177,15 @@ def _key(step: WholeStep) -> tuple[object, ...]:
 
 
 class _Sorting:
-    """The launches that sort splats by depth and pairs by tile, and their scratch memory.
-
-    Parameters
-    ----------
-    arena : Arena
-    count : int
-        Number of splats.
-    tiles : int
-    room : int
-        Pairs of splat and tile to reserve.
-
-    Attributes
-    ----------
-    most_room : int
-        Pairs that fit into the allocated memory.
-    bits : int
-        Bits of the tile keys.
-    order, ends : Tensor
-        Splats by depth, and the running sum of their pairs.
-    keys, payloads : Tensor
-        Pairs as emitted.
-    tile_keys, entries : Tensor
-        Pairs sorted by tile.
-    """
+    """The launches that sort ``count`` splats by depth and ``room`` pairs by tile, and their scratch memory."""
 
     def __init__(self, arena: Arena, count: int, tiles: int, room: int) -> None:
         self._arena, self._count, self._tiles = arena, count, tiles
-        self.bits = 16 if tiles < 1 << 15 else 32
+        self.bits = 16 if tiles < 1 << 15 else 32  # of the tile keys
         self._passes = len(passes_of(tiles.bit_length()))
         key = torch.int16 if self.bits == 16 else torch.int32
         entries = arena.get("entries", room, torch.int32)
-        self.most_room = len(entries)
+        self.most_room = len(entries)  # pairs that fit into the allocated memory
         keys = [arena.get(f"{name}_{self.bits}", self.most_room, key, spare=1) for name in ("keys", "more_keys")]
         payloads = [arena.get("payloads", self.most_room, torch.int32, spare=1), entries]
         self._keys, self._payloads = keys, payloads
@@ -313,13 +278,8 @@ class _Sorting:
 class _Losses:
     """The launches of the losses, which compute gradients of images but no values.
 
-    Parameters
-    ----------
-    step : WholeStep
-    images : mapping of str to Tensor
-        Blended images, "maps" for the SSIM, and the gradient "g_color".
-    upstream : mapping of str to Tensor
-        Gradients of the images besides colour, by name of the image: "alpha", "normal" and a depth.
+    ``images`` are the blended images, "maps" for the SSIM, and the gradient "g_color". ``upstream`` are the gradients
+    of the images besides colour, by name of the image: "alpha", "normal" and a depth.
     """
 
     def __init__(self, step: WholeStep, images: Mapping[str, Tensor], upstream: Mapping[str, Tensor]) -> None:

@@ -93,21 +93,10 @@ def blend_gradients(
 ) -> Work:
     """Compute the gradients of the blending, summed for each splat.
 
-    Parameters
-    ----------
-    tiles : int
-    lists, images : mapping
-        Lists and images of the forward pass.
-    upstream : mapping
-        Gradients of the images by name; absent or None: no gradient.
-    sums : mapping
-        "gradients", "extras", "slots" and "learns"; without "gradients", only colour gradients are computed.
-    pieces : ctypes.Structure
-        ``Pieces`` of pixels.h, of the forward pass; none if there are further channels.
-    absolute : bool
-        Whether to gather the absolute densification signal.
-    features : ctypes.Structure, optional
-        ``Features`` of pixels.h: further channels.
+    ``lists``, ``images`` and ``pieces`` are those of the forward pass; there are no pieces with further channels
+    (``features``). ``upstream`` are the gradients of the images by name; absent or None: no gradient. ``sums`` are
+    "gradients", "extras", "slots" and "learns"; without "gradients", only colour gradients are computed. ``absolute``:
+    whether to gather the absolute densification signal.
     """
     blocks = tiles + int(pieces.capacity)
     if sums.get("gradients") is None:
@@ -136,15 +125,9 @@ def splat_gradients(
 ) -> Work:
     """Compute the gradients of the parameters from the sums of :func:`blend_gradients`.
 
-    Parameters
-    ----------
-    splats : mapping of attribute to Tensor
-    sums : mapping
-        "tile_counts", "learns", "gradients" and "extras"; without "gradients", only colour gradients are computed.
-    gradients : mapping of name to Tensor or None
-        Output tensors by attribute, "probe" and "intrinsics"; absent or None: not computed.
-    clears : bool
-        Whether to reset the sums to zero.
+    ``sums`` are "tile_counts", "learns", "gradients" and "extras"; without "gradients", only colour gradients are
+    computed. ``gradients`` are the output tensors by attribute, "probe" and "intrinsics"; absent or None: not computed.
+    ``clears``: whether to reset the sums to zero.
     """
     count = len(splats["means"])
     scalars = {"count": count, "sh_rest": splats["shN"].shape[1], "clears": int(clears)}

@@ -34,25 +34,12 @@ def expose(
     coverage: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Tensor:
-    """Apply the transform of a camera to a rendered image.
+    """Apply the transform [3, 4] of a camera to a rendered image [H, W, 3], differentiably in both.
 
-    With k = ``coverage`` (default 1) and B = ``background``: A (C - (1 - k) B) + k b + (1 - k) B. On the CPU in float32
-    the bits of the image and its gradients do not depend on the number of threads.
-
-    Parameters
-    ----------
-    color : Tensor [H, W, 3]
-        Rendered over the background; not clamped.
-    transform : Tensor [3, 4]
-    coverage : Tensor [H, W], optional
-        Alpha in [0, 1] of the object; without it, the object covers the image. Not differentiated.
-    background : Tensor [3], optional
-        Required with ``coverage``.
-
-    Returns
-    -------
-    Tensor [H, W, 3]
-        Differentiable in ``color`` and ``transform``.
+    With k = ``coverage`` (default 1) and B = ``background`` [3]: A (C - (1 - k) B) + k b + (1 - k) B. The image is
+    rendered over the background and not clamped; ``coverage`` [H, W] is the alpha in [0, 1] of the object, which is not
+    differentiated and without which the object covers the image. On the CPU in float32 the bits of the image and its
+    gradients do not depend on the number of threads.
     """
     arrays = {"color": (color, "H W 3"), "transform": (transform, "3 4")}
     if coverage is not None:
@@ -127,18 +114,10 @@ def fit_exposure(
     coverage: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Tensor:
-    """Fit the transform [3, 4] from a rendered image to a photograph by least squares over some pixels.
+    """Fit the transform [3, 4] from a rendered image to a photograph, [H, W, 3] over the background, by least squares.
 
-    A ridge of ``RIDGE`` per pixel pulls the transform to the identity where the pixels do not determine it.
-
-    Parameters
-    ----------
-    color, target : Tensor [H, W, 3]
-        Rendering and photograph, over the background.
-    pixels : Tensor [H, W] bool
-        Pixels to fit; without any, the result is the identity.
-    coverage, background
-        As for :func:`expose`.
+    Only ``pixels`` [H, W] bool count; without any, the result is the identity. A ridge of ``RIDGE`` per pixel pulls the
+    transform to the identity where the pixels do not determine it. The others are as for :func:`expose`.
     """
     check_shapes({"color": (color, "H W 3"), "target": (target, "H W 3"), "pixels": (pixels, "H W")})
     light, weight, wanted = color.double(), torch.ones_like(color[..., :1], dtype=torch.float64), target.double()

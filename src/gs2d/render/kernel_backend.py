@@ -30,26 +30,16 @@ class ViewOfSplats(NamedTuple):
 class Gradients:
     """Inputs and outputs of a backward pass.
 
-    Attributes
-    ----------
-    saved : mapping of str to Tensor
-        Outputs and hidden tensors of the forward pass, parameters, and "values" and "background" of further channels.
-        Colours are [H, W, 3].
-    upstream : mapping of str to Tensor or None
-        Gradients of the images by name.
-    wanted : mapping of str to Tensor or None
-        Memory for the gradients of the parameters, "probe", "intrinsics" [N, 4] and "values"; None: not computed.
-    rows : Tensor [N] bool or None
-        Splats with gradients; all others get zeros.
-    wide : (Tensor [H, W, 3 + F], Tensor [H, W, 3 + F]) or None
-        The image with further channels, and its gradient.
+    ``saved`` are the outputs and hidden tensors of the forward pass, the parameters, and "values" and "background" of
+    further channels; its colours are [H, W, 3]. ``wanted`` is memory for the gradients of the parameters, "probe",
+    "intrinsics" [N, 4] and "values"; None: not computed.
     """
 
     saved: Mapping[str, Tensor]
-    upstream: Mapping[str, Tensor | None]
+    upstream: Mapping[str, Tensor | None]  # gradients of the images by name
     wanted: Mapping[str, Tensor | None]
-    rows: Tensor | None
-    wide: tuple[Tensor, Tensor] | None
+    rows: Tensor | None  # [N] bool, splats with gradients; all others get zeros
+    wide: tuple[Tensor, Tensor] | None  # the image with further channels [H, W, 3 + F], and its gradient
 
 
 class KernelBackend(Backend):
@@ -65,14 +55,9 @@ class KernelBackend(Backend):
     ) -> tuple[dict[str, Tensor], dict[str, Tensor], Any]:
         """Render one view.
 
-        Returns
-        -------
-        outputs : dict of Tensor
-            Images and radii, in the order of RenderOutput. With ``features`` [N, F], colours are [H, W, 3 + F].
-        hidden : dict of Tensor
-            Further tensors for the backward pass.
-        state : object
-            Further state for the backward pass, which does not refer to ``outputs``.
+        Returns outputs, hidden tensors for the backward pass, and further state for it, which does not refer to the
+        outputs. The outputs are images and radii, in the order of RenderOutput. With ``features`` [N, F], colours are
+        [H, W, 3 + F].
         """
         raise NotImplementedError
 

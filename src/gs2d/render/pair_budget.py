@@ -34,18 +34,11 @@ class PairBudget:
     pairs are dropped. ``overflow`` then tells the device at once, so that updates change nothing, and ``overflowed``
     tells the host later, so that the caller repeats the iteration with ``exact`` set. Both cover all renderings since
     the last call of ``overflowed``, since an iteration may render two views.
-
-    Attributes
-    ----------
-    exact : bool
-        Whether the next renderings wait for their counts.
-    overflow : Tensor [] int32 or None
-        Whether a rendering lacks pairs, on the device. None if all renderings were exact.
     """
 
     def __init__(self) -> None:
-        self.exact = False
-        self.overflow: Tensor | None = None
+        self.exact = False  # whether the next renderings wait for their counts
+        self.overflow: Tensor | None = None  # [] int32 on the device: whether one lacks pairs; None: all were exact
         self._largest: dict[int, float] = {}  # by the number of tiles
         self._of_view: dict[bytes, tuple[int, int]] = {}  # pairs, and splats at that time, by camera
         self._asked: list[tuple[Rendering, int]] = []  # renderings with unknown counts, and their room
@@ -99,10 +92,7 @@ class PairBudget:
     def overflowed(self) -> bool:
         """Whether a rendering lacked pairs; waits for the counts, not for the renderings.
 
-        Raises
-        ------
-        BackendError
-            If an earlier kernel failed: torch reports it here first.
+        Raises BackendError if an earlier kernel failed: torch reports it here first.
         """
         asked, self._asked, self.overflow = self._asked, [], None
         if asked and self._event is not None:

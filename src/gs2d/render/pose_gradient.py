@@ -23,16 +23,7 @@ from gs2d.render.types import RenderOutput
 
 
 def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
-    """Return the same splats; their gradients also reach the camera's pose.
-
-    Parameters
-    ----------
-    splats : Splats
-    pose : Tensor [4, 4]
-        T_cam_world, of any floating dtype and on any device.
-    sh_degree : int
-        Evaluated degree.
-    """
+    """Return the same splats; their gradients also reach the camera's ``pose``, a tensor of any dtype on any device."""
     moving = {"means": splats.means, "quats": splats.quats} | ({"sh0": splats.sh0} if sh_degree > 0 else {})
     tensors = _Carry.apply(pose, splats.shN.detach(), sh_degree, *moving.values())
     return replace(splats, **dict(zip(moving, tensors, strict=True)))

@@ -27,15 +27,9 @@ class Pairs:
 def evaluate_pairs(
     screen: ScreenSplats, points: Tensor, settings: RasterSettings, shift: Tensor | None = None
 ) -> Pairs:
-    """Evaluate intersection, low-pass filter and near test (rules 3, 4, 5).
+    """Evaluate intersection, low-pass filter and near test (rules 3, 4, 5) of n splats at ``points`` [P, 2] px.
 
-    Parameters
-    ----------
-    screen : ScreenSplats
-        n splats.
-    points : Tensor [P, 2] px
-    shift : Tensor [n, P, 2], optional
-        Zeros added to (Tu.z, Tv.z), for their gradient (rule 13).
+    ``shift`` [n, P, 2] are zeros added to (Tu.z, Tv.z), for their gradient (rule 13).
     """
     delta = points[None] - screen.center[:, None]  # [n, P, 2] px, from the projected centre
     h_u = delta[..., 0:1] * screen.Tw[:, None] - screen.Au[:, None]  # [n, P, 3]: the plane through pixel column x
@@ -65,18 +59,9 @@ def evaluate_pairs(
 
 
 def blend_weights(alpha: Tensor, settings: RasterSettings) -> tuple[Tensor, Tensor]:
-    """Return weights w and incoming transmittance T of each pair (rule 7).
+    """Return weights w and incoming transmittance T [n, P] of each pair (rule 7) from alpha [n, P].
 
-    Parameters
-    ----------
-    alpha : Tensor [n, P]
-        0 for skipped pairs.
-
-    Returns
-    -------
-    w : Tensor [n, P]
-        0 for skipped pairs and after a pixel has stopped.
-    T : Tensor [n, P]
+    Alpha is 0 for skipped pairs; w is 0 for them and after a pixel has stopped.
     """
     with torch.no_grad():
         live = (1 - alpha).cumprod(dim=0) >= settings.transmittance_min  # monotone: once False, False to the end

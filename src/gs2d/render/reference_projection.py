@@ -61,12 +61,7 @@ class PixelBlock:
 
 
 def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, for_errors: bool) -> Tensor:
-    """Return the rows that rules 5, 6, 16, 19, 23 and 24 do not cull, by increasing depth, ties by index (rule 2).
-
-    Returns
-    -------
-    Tensor [M] int64
-    """
+    """Return the rows [M] that rules 5, 6, 16, 19, 23, 24 do not cull, by increasing depth, ties by index (rule 2)."""
     used = splats.detach()
     keep = used.quats.abs().amax(dim=1) >= MIN_QUATERNION
     shN = used.shN[:, : num_coefficients(max(settings.sh_degree, 0)) - 1]
@@ -91,14 +86,7 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
 
 
 def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettings) -> ScreenSplats:
-    """Project splats to a camera, with the Mip filter, if there is one; differentiable.
-
-    Parameters
-    ----------
-    splats : Splats
-    rows : Tensor [M] int64
-        From :func:`visible_rows`.
-    """
+    """Project ``rows`` [M] of :func:`visible_rows` to a camera, with the Mip filter if there is one; differentiable."""
     means = splats.means[rows]
     frames = quats_to_matrices(splats.quats[rows])  # [M, 3, 3], columns t_u, t_v, t_w in the world
     scales = splats.log_scales[rows].exp().clamp(min=MIN_SIZE)  # [M, 2] world units
@@ -163,18 +151,9 @@ def _mip_filtered(screen: ScreenSplats, sigma: float) -> ScreenSplats:
 
 
 def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
-    """Return the screen boxes of rule 14 for the disc rho3d <= k^2, clipped to the image.
+    """Return the screen boxes of rule 14 for the disc rho3d <= k^2 = ``cutoff_squared`` [M], clipped to the image.
 
-    Parameters
-    ----------
-    screen : ScreenSplats
-    cutoff_squared : Tensor [M]
-        k^2.
-
-    Returns
-    -------
-    Tensor [M, 4] float64, px
-        x_min, y_min, x_max, y_max. Empty boxes have max < min.
+    They are x_min, y_min, x_max and y_max, [M, 4] float64, px. Empty boxes have max < min.
     """
     k2 = cutoff_squared.detach().double()
     exact = _boxes(screen, k2, camera, settings)

@@ -19,16 +19,10 @@ def fraction_before(x: Tensor) -> Tensor:
 
 
 def transmittance_at(z: Tensor, alpha: Tensor, inverse_depth: Tensor, width: float) -> Tensor:
-    """Return T(z) = prod (1 - alpha_i F((z / z_i - 1) / width)) [P].
+    """Return T(z) = prod (1 - alpha_i F((z / z_i - 1) / width)) [P] at depths z [P], world units.
 
-    Parameters
-    ----------
-    z : Tensor [P] world units
-    alpha : Tensor [n, P]
-        0 for pairs that are not blended.
-    inverse_depth : Tensor [n, P] 1 / world units
-    width : float
-        Half width as a fraction of the depth.
+    ``alpha`` [n, P] is 0 for pairs that are not blended; ``inverse_depth`` is [n, P]. ``width`` is half the width of
+    the interval as a fraction of the depth.
     """
     return (1 - alpha * fraction_before((z * inverse_depth - 1) / width)).prod(dim=0)
 

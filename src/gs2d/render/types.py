@@ -125,18 +125,10 @@ class Contributors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Plain channels besides the three of ``sh0``, blended with the same weights.
+    """Plain channels besides the three of ``sh0``, blended with the same weights."""
 
-    Attributes
-    ----------
-    values : Tensor [N, F]
-        Any sign; dtype and device of the splats.
-    background : Tensor [F]
-        Background; dtype and device of the splats, without gradient.
-    """
-
-    values: Tensor
-    background: Tensor
+    values: Tensor  # [N, F], any sign; dtype and device of the splats
+    background: Tensor  # [F]; dtype and device of the splats, without gradient
 
 
 @dataclass(frozen=True, eq=False)

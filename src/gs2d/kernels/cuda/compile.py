@@ -91,12 +91,7 @@ def architecture_for(capability: tuple[int, int]) -> str:
 
     A device newer than the compiler runs code for an older one of the same major version. For a newer major version the
     result is PTX of the newest known architecture, such as ``"compute_120"``, which the driver translates. Without a
-    compiler it is an architecture that the cache may hold.
-
-    Raises
-    ------
-    BackendError
-        If no architecture fits the device.
+    compiler it is an architecture that the cache may hold. Raises BackendError if no architecture fits the device.
     """
     if capability < MIN_CAPABILITY:
         raise BackendError(
@@ -129,21 +124,11 @@ def _known_architectures() -> list[int]:
 
 
 def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
-    """Compile one file, without the cache.
+    """Compile one of :func:`source_names`, without the cache.
 
-    Parameters
-    ----------
-    name : str
-        One of :func:`source_names`.
-    arch : str
-        Such as ``"sm_90"``, or ``"compute_90"`` for PTX.
-    options : sequence of str
-        NVRTC options besides the architecture.
-
-    Raises
-    ------
-    BackendError
-        If NVRTC is missing, does not know the architecture, or rejects the source (with its first error).
+    The architecture is ``"sm_90"`` or the like, or ``"compute_90"`` for PTX. ``options`` are those of NVRTC besides the
+    architecture. Raises BackendError if NVRTC is missing, does not know the architecture, or rejects the source (with
+    its first error).
     """
     files = sources()
     headers = {key: text for key, text in files.items() if key.endswith(".h")}
@@ -155,14 +140,8 @@ def compile_text(
 ) -> Cubin:
     """Compile a source that is not part of the package (the benchmarks' probes).
 
-    Parameters
-    ----------
-    text, name : str
-        The source, and its name in messages.
-    arch, options
-        As for :func:`compile_source`.
-    headers : mapping of str to str
-        Files that it may include, by name.
+    ``name`` is for messages, ``headers`` are the files that it may include, by name. The others are as for
+    :func:`compile_source`.
     """
     nvrtc = _nvrtc()
     headers = {} if headers is None else headers
@@ -232,14 +211,8 @@ def _key(name: str, arch: str) -> str:
 def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
     """Return the machine code of one file for one architecture: cached, or compiled.
 
-    A cache that cannot be read or written only costs compile time.
-
-    Parameters
-    ----------
-    name, arch
-        As for :func:`compile_source`.
-    folder : Path, optional
-        Instead of :func:`cache_folder`.
+    The folder of the cache is :func:`cache_folder` by default. A cache that cannot be read or written only costs
+    compile time.
     """
     stem = name.rpartition("/")[2].removesuffix(".cu")
     folder = folder or cache_folder()

@@ -33,19 +33,8 @@ def adam_step(
 ) -> None:
     """Run one Adam step on up to six attributes, in place, in one launch; the arithmetic of torch's fused Adam.
 
-    Parameters
-    ----------
-    updates : sequence of AdamUpdate
-    beta1, beta2, eps : float
-    launcher : Launcher
-        Launcher of the tensors' device.
-    skip : Tensor [] int32, optional
-        On the device; if it is not 0, nothing is changed.
-
-    Raises
-    ------
-    ShapeError
-        If a tensor has another shape, dtype or device.
+    If ``skip`` [] int32 on the device is not 0, nothing is changed. Raises ShapeError if a tensor has another shape,
+    dtype or device.
     """
     if len(updates) > 6:
         raise ShapeError(f"adam_step takes up to 6 attributes, got {len(updates)}")

@@ -18,10 +18,7 @@ OLDEST_CUDA = (12, 0)  # first version that loads kernels for all devices at onc
 def machine() -> str:
     """Return a line about a machine that can run the kernels, without creating a GPU context.
 
-    Raises
-    ------
-    BackendError
-        With the first obstacle, in the order in which a user would fix them, and after "; " its remedy.
+    Raises BackendError with the first obstacle, in the order in which a user would fix them, and after "; " its remedy.
     """
     if torch.version.cuda is None:
         raise BackendError(
@@ -77,10 +74,7 @@ def cache_words() -> str:
 def seen_devices() -> list[tuple[str, tuple[int, int]]]:
     """Return name and compute capability of the devices visible to torch, the current one first.
 
-    Raises
-    ------
-    BackendError
-        If there is none; with torch's warning.
+    Raises BackendError with torch's warning if there is none.
     """
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

@@ -15,14 +15,7 @@ from gs2d.kernels.cuda.driver import call, failure
 class Work:
     """A launch that is repeated with the same argument structure.
 
-    Parameters
-    ----------
-    name : str
-        Name of the kernel.
-    blocks, threads : int
-        ``blocks`` may change but must not be 0.
-    arguments : ctypes.Structure
-        May be changed between launches.
+    Arguments and ``blocks``, which must not be 0, may be changed between launches.
     """
 
     __slots__ = ("_pointer", "arguments", "blocks", "name", "parameters", "threads")
@@ -34,21 +27,9 @@ class Work:
 
 
 class Graph:
-    """A graph of sequential launches.
+    """A graph of sequential launches, with the handle of a loaded kernel for each of them.
 
-    Parameters
-    ----------
-    driver : module
-        ``cuda.bindings.driver``.
-    kernels : sequence
-        Handles of loaded kernels, one for each launch.
-    works : sequence of Work
-        With their first arguments.
-
-    Raises
-    ------
-    BackendError
-        If the driver cannot create the graph.
+    ``driver`` is the module ``cuda.bindings.driver``. Raises BackendError if it cannot create the graph.
     """
 
     def __init__(self, driver: Any, kernels: Sequence[Any], works: Sequence[Work]) -> None:

@@ -56,23 +56,10 @@ def _architecture_of(device: torch.device) -> str:
 class GpuLauncher:
     """Launches kernels on one device; a source file is compiled and loaded at the first launch of its kernels.
 
-    Parameters
-    ----------
-    device : torch.device
-        With an index.
-    driver : module, optional
-        Default: ``cuda.bindings.driver``.
-    stream_of, architecture_of : callable
-        Return the current stream's handle and the architecture (``"sm_90"``) of a device.
-    code_of : callable
-        Returns the machine code of a source file for an architecture.
-    source_of : mapping of str to str, optional
-        The source file of each kernel. Default: the package's.
-
-    Raises
-    ------
-    BackendError
-        If the driver or the device's context is missing, or the default streams of driver and torch differ.
+    The device has an index, and the driver is the module ``cuda.bindings.driver``. ``stream_of`` and
+    ``architecture_of`` return the current stream's handle and the architecture (``"sm_90"``) of a device, ``code_of``
+    the machine code of a source file for an architecture; ``source_of`` are the source files by kernel. Raises
+    BackendError if the driver or the device's context is missing, or the default streams of driver and torch differ.
     """
 
     def __init__(
@@ -106,11 +93,8 @@ class GpuLauncher:
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
         """Start a kernel on the current stream without waiting.
 
-        Raises
-        ------
-        BackendError
-            If there are too many blocks, the kernel does not compile or load, or the driver refuses the launch, also
-            because an earlier kernel failed.
+        Raises BackendError if there are too many blocks, the kernel does not compile or load, or the driver refuses the
+        launch, also because an earlier kernel failed.
         """
         if blocks > 0:
             with self._in_context():
@@ -216,15 +200,10 @@ def steps() -> str:
 
 
 def grow_in_place() -> bool:
-    """Enable torch's expandable memory segments, unless the user configured its allocator.
+    """Enable torch's expandable memory segments, unless the user configured its allocator; return whether they were.
 
     Each densification creates 18 tensors of new sizes, about 145 times a run. Without expandable segments the freed
     blocks are too small, and the device waits for new memory each time.
-
-    Returns
-    -------
-    bool
-        Whether they were enabled.
     """
     if torch.version.cuda is None or any(os.environ.get(name) for name in ALLOCATOR_VARIABLES):
         return False
@@ -244,12 +223,7 @@ def _of_device(index: int) -> GpuLauncher:
 def launcher_for(device: torch.device) -> Launcher:
     """Return the launcher of a device; one per device and process.
 
-    Raises
-    ------
-    ShapeError
-        If the device is not a CUDA device.
-    BackendError
-        If the device cannot run the kernels.
+    Raises ShapeError if the device is not a CUDA device, and BackendError if it cannot run the kernels.
     """
     if device.type != "cuda":
         raise ShapeError(
