@@ -48,19 +48,10 @@ def register_action(name: str) -> Callable[[Register], Register]:
 
 @dataclass(frozen=True)
 class Action:
-    """A registered entry action.
+    """A registered entry action; RecipeError if no action has this name.
 
-    Attributes
-    ----------
-    name : str
-    options : mapping of str to values of JSON
-        Keyword arguments of its constructor. An option called ``writes`` is the row group that the action writes, one
-        called ``rows`` the row group that it reads: an earlier action must write that.
-
-    Raises
-    ------
-    RecipeError
-        If no action has this name.
+    The options, values of JSON, are keyword arguments of its constructor. An option called ``writes`` is the row group
+    that the action writes, one called ``rows`` the row group that it reads: an earlier action must write that.
     """
 
     name: str

@@ -47,19 +47,10 @@ def register_densifier(name: str) -> Callable[[Register], Register]:
 
 @dataclass(frozen=True)
 class Densify:
-    """A registered densifier. ``GradDensify`` is that of 2DGS and AbsGS, with its options as fields.
+    """A registered densifier; ``GradDensify`` is that of 2DGS and AbsGS, with its options as fields.
 
-    Attributes
-    ----------
-    name : str
-    options : mapping of str to values of JSON
-        Keyword arguments of its constructor. Options called ``start`` and ``stop`` are iterations of the stage, and
-        scale with the schedule.
-
-    Raises
-    ------
-    RecipeError
-        If no densifier has this name.
+    The options, values of JSON, are keyword arguments of its constructor. Options called ``start`` and ``stop`` are
+    iterations of the stage, and scale with the schedule. Raises RecipeError if no densifier has this name.
     """
 
     name: str

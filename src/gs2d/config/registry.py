@@ -104,10 +104,7 @@ class Registry(Generic[T]):
     def make(self, name: str, *arguments: object, options: Mapping[str, Any], where: str = "") -> Any:
         """Return an object of a registered class, made with its options; ``where`` begins the error message.
 
-        Raises
-        ------
-        Gs2dError
-            As :meth:`get`, or if the class does not take the options.
+        Raises Gs2dError as :meth:`get`, or if the class does not take the options.
         """
         kind: Any = self.get(name)
         try:

@@ -217,20 +217,10 @@ def flatness(image: Tensor) -> Tensor:
 def normal_smoothness(normal: Tensor, alpha: Tensor, flatness: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean of f (sqrt(|n - n'|^2 + d^2) - d) over pixels and their neighbours to the right and below.
 
-    Neighbours are ``SMOOTH_REACH`` px apart, and d is ``SMOOTH_BEND``. f is the smaller flatness / 255 of both pixels;
-    0 where the rendered alpha is at most 1/2. It is the total variation of the normals where the image does not say
-    what the surface is: planes stay planes, edges are sharp, and highlights make no pits.
-
-    Parameters
-    ----------
-    normal : Tensor [H, W, 3]
-        sum w n, world frame.
-    alpha : Tensor [H, W]
-        A constant.
-    flatness : Tensor [H, W] uint8
-        :func:`flatness` of the image.
-    mask : Tensor [H, W] bool, optional
-        False = ignore the pixel.
+    Neighbours are ``SMOOTH_REACH`` px apart, n is ``normal`` [H, W, 3], sum w n in the world frame, and d is
+    ``SMOOTH_BEND``. f is the smaller :func:`flatness` / 255 of both pixels; 0 where the rendered ``alpha``, a constant,
+    is at most 1/2. It is the total variation of the normals where the image does not say what the surface is: planes
+    stay planes, edges are sharp, and highlights make no pits.
     """
     normal = fill_ignored(normal, torch.zeros_like(normal), mask)
     weights = (alpha.detach() > 0.5) * (flatness.to(normal.dtype) / 255)

@@ -94,16 +94,11 @@ def _normals(output: RenderOutput, view: LossView) -> Tensor:
 class NormalConsistency(Loss):
     """1 - alpha <n, N> of rendered normals n and normals N of the depth map, the form of the official 2DGS code.
 
-    Parameters
-    ----------
-    edges : "undefined" or "camera"
-        Beside empty pixels: N is undefined, or empty pixels lie at the camera's centre as in the official code.
-    where : "image" or "object"
-        All pixels count, or those of the object alone, so that covering the empty background earns nothing. The object
-        is where alpha of the image is above 1/2; in images without alpha, each pixel counts by the rendered alpha.
-    flat : float
-        Factor of the weight where the photograph has no texture (``formulas.flatness``): there colours alone do not
-        determine the surface, and highlights mislead it.
+    ``edges``: beside empty pixels N is "undefined", or these lie at the "camera" centre as in the official code.
+    ``where``: all pixels of the "image" count, or those of the "object" alone, so that covering the empty background
+    earns nothing. The object is where alpha of the image is above 1/2; in images without alpha, each pixel counts by
+    the rendered alpha. ``flat`` is the factor of the weight where the photograph has no texture
+    (``formulas.flatness``): there colours alone do not determine the surface, and highlights mislead it.
     """
 
     kind, per_splat = "normal_consistency", False
@@ -205,10 +200,7 @@ class Distortion(Loss):
 class SilhouetteLoss(Loss):
     """Absolute difference of the rendered alpha and that of the image.
 
-    Parameters
-    ----------
-    required : bool
-        Whether images must have an alpha channel; if not, those without skip the loss.
+    Images without an alpha channel skip the loss, unless one is ``required``.
     """
 
     def __init__(self, required: bool = True) -> None:

@@ -61,13 +61,6 @@ class CachedViews:
     ``state``: geometry, opacity and the colours outside the group stay constant. ``stage``: a stage for which
     :func:`is_cacheable` is true. ``limit_bytes``: limit for all cached views together. ``least``: if fewer views of the
     size of the first would fit, none is cached.
-
-    Attributes
-    ----------
-    rows : Tensor [M] int64
-        Rows of the group.
-    views : list of CachedView
-        Training views 0, 1, ...
     """
 
     def __init__(
@@ -75,8 +68,8 @@ class CachedViews:
     ) -> None:
         self._whole = whole
         (group,) = set(stage.train.values())
-        self.rows: Tensor | None = state.groups[group].nonzero().squeeze(1)
-        self.views: list[CachedView] = []
+        self.rows: Tensor | None = state.groups[group].nonzero().squeeze(1)  # [M] int64, of the group
+        self.views: list[CachedView] = []  # training views 0, 1, ...
         settings, room = whole.settings(stage, 1), limit_bytes
         for index in range(len(whole.scene.train)):
             camera = whole.camera(state, index)

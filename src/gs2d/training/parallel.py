@@ -50,19 +50,9 @@ class LostContactError(RunError):
 class ProcessGroup:
     """The processes that train together: this one alone, or the default group of ``torch.distributed``.
 
-    In a single process, the collective operations do nothing. The group of several must be initialised.
-
-    Parameters
-    ----------
-    place : ProcessRank, optional
-        Without it, a single process.
-    hears : callable
-        Returns whether this process has received a request to stop.
-
-    Attributes
-    ----------
-    stop_asked : bool
-        Whether any process had received a request to stop at the last :meth:`meet`.
+    In a single process, that without a ``place``, the collective operations do nothing. The group of several must be
+    initialised. ``hears`` returns whether this process has received a request to stop, ``stop_asked`` whether any
+    process had at the last :meth:`meet`.
     """
 
     def __init__(self, place: ProcessRank | None = None, hears: Callable[[], bool] = lambda: False) -> None:
@@ -185,15 +175,8 @@ class ProcessGroup:
 
         ``turns``: at most one for each process. ``one``: returns loss and gradients of one view. ``idle``: returns the
         result of a process without a view: zeros. ``rows`` [M] int64: rows that the gradients of splats are restricted
-        to. ``learned``: shape of a row of each learned quantity.
-
-        Returns
-        -------
-        StepResult
-            ``losses``, ``signal`` and ``radii`` belong to the view of this process (:meth:`mean_losses`,
-            :meth:`gather`).
-        sequence of mapping
-            ``StepResult.learned`` of each view.
+        to. ``learned``: shape of a row of each learned quantity. In the result, ``losses``, ``signal`` and ``radii``
+        belong to the view of this process (:meth:`mean_losses`, :meth:`gather`).
         """
         rank = self.place.rank
         if self._alone:

@@ -50,27 +50,13 @@ def train(
     allowed: tuple[str, ...] = (),
     prepare: Callable[[TrainOptions, OnEvent], LoadedRun] | None = None,
 ) -> RunFolder:
-    """Train a run and write splats, mesh, metrics, page and report.
+    """Train a run and write splats, mesh, metrics, page and report; return the finished run.
 
     A run that fails before its first checkpoint leaves nothing behind. One that is interrupted later can be resumed,
-    with a byte-identical ``splats.ply``. Raises Gs2dError if options, capture or machine do not allow the run; the
+    with a byte-identical ``splats.ply``. ``title`` is the heading of the report, by default the name of the capture.
+    Files named in ``allowed`` may already be in ``options.out``. ``prepare`` makes the run from the options, for a part
+    of a scene, whose splats only are written. Raises Gs2dError if options, capture or machine do not allow the run; the
     message says what to do.
-
-    Parameters
-    ----------
-    on_event : callable
-        Receives :mod:`gs2d.training.events`.
-    title : str
-        Heading of the report; empty: the name of the capture.
-    allowed : tuple of str
-        Names of files that may already be in ``options.out``.
-    prepare : callable, optional
-        Makes the run from the options, for a part of a scene, whose splats only are written.
-
-    Returns
-    -------
-    RunFolder
-        The finished run.
     """
     with connected(options.backend) as together:
         use_threads(options.threads, together.place.local_size)

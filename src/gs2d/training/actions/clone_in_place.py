@@ -19,14 +19,8 @@ from gs2d.training.state import TrainState
 class CloneInPlace(EntryAction):
     """Append a copy of the rows of a group.
 
-    Clones belong to every group of their originals, and to a group of their own.
-
-    Parameters
-    ----------
-    rows, writes : str
-        Row groups of the originals and of the clones.
-    opacity : "copy" or "preserve"
-        With "preserve", originals and clones get 1 - sqrt(1 - o). The transmittance at their centre stays 1 - o.
+    Clones belong to every group of their originals, and to the group ``writes`` of their own. With ``opacity``
+    "preserve" instead of "copy", both get 1 - sqrt(1 - o), so that the transmittance at their centre stays 1 - o.
     """
 
     def __init__(self, rows: str, writes: str, opacity: str = "copy") -> None:

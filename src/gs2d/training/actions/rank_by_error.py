@@ -18,16 +18,9 @@ from gs2d.training.state import TrainState
 
 @register_action("rank_by_error")
 class RankByError(EntryAction):
-    """Write the row group of the splats with the largest E_i.
+    """Write the row group of the ``top_percent`` of the splats with the largest E_i.
 
-    Parameters
-    ----------
-    writes : str
-        Name of the row group.
-    top_percent : float
-        Percentage of the splats in it.
-    occlusion : bool
-        Whether a pixel counts only for the splats that are blended there.
+    ``occlusion``: whether a pixel counts only for the splats that are blended there.
     """
 
     def __init__(self, writes: str, top_percent: float = 1.0, occlusion: bool = False) -> None:

@@ -34,20 +34,13 @@ class Surroundings:
 class Densifier:
     """Base class of densifiers; changes nothing.
 
-    Only ``training.rows.append_rows`` and ``keep_rows`` change the number of splats; they keep all data of a splat
-    together. Statistics of splats are in ``state.statistics``, tensors [N, ...] by name, and are saved with the run.
-    Everything else must follow from the options and the iteration, so that a resumed run does the same.
+    The constructor takes the options of the recipe (``Densify.options``) as keyword arguments; a wrong one raises
+    TypeError. Only ``training.rows.append_rows`` and ``keep_rows`` change the number of splats; they keep all data of a
+    splat together. Statistics of splats are in ``state.statistics``, tensors [N, ...] by name, and are saved with the
+    run. Everything else must follow from the options and the iteration, so that a resumed run does the same.
 
-    Parameters
-    ----------
-    **options
-        Options of the recipe (``Densify.options``); a wrong one raises TypeError.
-
-    Attributes
-    ----------
-    shares_views : bool
-        Whether it works in several processes, each with another view. It then reads ``losses``, ``signal`` and
-        ``radii`` of the output only through ``surroundings.processes``, or not at all.
+    ``shares_views``: whether it works in several processes, each with another view. It then reads ``losses``,
+    ``signal`` and ``radii`` of the output only through ``surroundings.processes``, or not at all.
     """
 
     shares_views = False

@@ -35,10 +35,7 @@ OPACITY_CAP = 0.8  # AbsGS
 class GradientDensifier(Densifier):
     """Clones or splits splats with a large mean screen gradient, prunes faint and large ones, resets opacities.
 
-    Parameters
-    ----------
-    **options
-        Fields of GradDensify.
+    The options are the fields of GradDensify.
     """
 
     shares_views = True

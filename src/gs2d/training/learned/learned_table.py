@@ -29,12 +29,8 @@ class LearnedTable:
     """The learned quantities of a recipe on a scene. Their rows are in the training state.
 
     The constructor raises RecipeError if the package of a quantity cannot be imported, or it does not take its options.
-    ``scene``: scene with the cameras of the capture, at full size.
-
-    Attributes
-    ----------
-    quantities : dict of name to LearnedQuantity
-        In the order in which they are applied.
+    ``scene``: scene with the cameras of the capture, at full size. ``quantities`` are in the order in which they are
+    applied.
     """
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:

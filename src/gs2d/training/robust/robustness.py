@@ -81,18 +81,9 @@ class Robustness:
     together. Process 0 makes the start and the trials for all. ``frozen``: further splats of the scene, which are not
     trained. ``sweep``: plane sweep of the scene with the settings of the recipe, if it is there already.
 
-    Attributes
-    ----------
-    scene : Scene
-        Scene with the points that training starts from.
-    lacks : str
-        Reason if an optional dense start failed, else empty.
-
-    Raises
-    ------
-    DataError
-        From the constructor, if floaters are to be removed and the capture lacks sparse points and the images that show
-        them, or if a required dense start finds nothing.
+    The constructor raises DataError if floaters are to be removed and the capture lacks sparse points and the images
+    that show them, or if a required dense start finds nothing. ``scene`` has the points that training starts from;
+    ``lacks`` is the reason if an optional dense start failed, else empty.
     """
 
     def __init__(

@@ -63,23 +63,10 @@ def shine_maps(
     backend: Backend,
     library: Library,
 ) -> Tensor:
-    """Return how shiny the surface is in each photograph.
+    """Return how shiny the surface is in each photograph: [V, CELLS, CELLS] uint8, from 0, matt, to 255.
 
-    Parameters
-    ----------
-    splats : Splats
-    image_at : callable
-        Returns a downscaled photograph.
-    neighbours : sequence of sequence of int
-        Photographs that each one is compared with; without any, all of it counts as matt.
-    settings : RasterSettings
-    backend : Backend
-    library : Library
-
-    Returns
-    -------
-    Tensor [V, CELLS, CELLS] uint8
-        From 0, matt, to 255.
+    ``image_at`` returns a downscaled photograph. ``neighbours`` are the photographs that each one is compared with;
+    without any, all of it counts as matt.
     """
     settings = settings.for_depths("transmittance")
 
