@@ -65,21 +65,12 @@ class Lens:
 
 
 class CameraModel:
-    """Base class of camera models. A class is registered; it is created without arguments.
+    """Base class of camera models. A class is registered; it is created without arguments."""
 
-    Attributes
-    ----------
-    parameters : tuple of str
-        Keys of ``transforms.json`` that fill ``Lens.radial``, for frames whose ``camera_model`` is the registered name.
-    is_wide : bool
-        Whether photographs of more than 120 degrees are cut into faces.
-    wraps : bool
-        Whether the left edge of a photograph continues at its right edge.
-    """
-
+    # Keys of ``transforms.json`` that fill ``Lens.radial``, for frames whose ``camera_model`` is the registered name.
     parameters: tuple[str, ...] = ()
-    is_wide: bool = False
-    wraps: bool = False
+    is_wide: bool = False  # whether photographs of more than 120 degrees are cut into faces
+    wraps: bool = False  # whether the left edge of a photograph continues at its right edge
 
     def project(self, lens: Lens, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the points [..., 2] of rays [..., 3], in focal lengths, and which rays the lens shows [...] bool."""

@@ -32,10 +32,7 @@ DEFAULT_CACHE_BYTES = 4 << 30  # of decoded images, if memory is not limited
 def detect_format(path: str | os.PathLike[str]) -> str:
     """Return the format of a folder: one of FORMATS, or that of a third-party reader.
 
-    Raises
-    ------
-    DataError
-        If the folder is missing, empty or of unknown format; lists the expected files.
+    Raises DataError if the folder is missing, empty or of unknown format; lists the expected files.
     """
     root = _folder(path)
     looked_for = []

@@ -79,10 +79,7 @@ class View:
     def image(self) -> np.ndarray:
         """Return the image, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
 
-        Raises
-        ------
-        DataError
-            If the file does not decode or no longer exists.
+        Raises DataError if the file does not decode or no longer exists.
         """
         return self._image().image
 
@@ -103,10 +100,7 @@ class View:
     def usable(self, *, masks: bool) -> np.ndarray | None:
         """Return the pixels that training and scores use, bool [H, W]; None: all.
 
-        Parameters
-        ----------
-        masks : bool
-            Whether the protocol uses masks. True: ``mask()``, which excludes invalid pixels too; False: ``valid()``.
+        If the protocol uses masks: ``mask()``, which excludes invalid pixels too; else ``valid()``.
         """
         return self.mask() if masks else self.valid()
 

@@ -36,14 +36,9 @@ REMEDY = (
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """The network: VGG-16 convolutions and heads.
+    """The network: VGG-16 convolutions and heads."""
 
-    Attributes
-    ----------
-    weights : mapping of str to Tensor
-        ``features.{i}.weight`` [out, in, 3, 3], ``features.{i}.bias`` [out] and ``lin{b}.model.1.weight`` [1, C, 1, 1].
-    """
-
+    # ``features.{i}.weight`` [out, in, 3, 3], ``features.{i}.bias`` [out] and ``lin{b}.model.1.weight`` [1, C, 1, 1]
     weights: Mapping[str, Tensor]
 
     @property

@@ -27,20 +27,11 @@ _WIDE = 6.0  # cells; smoothing that fills gaps between points
 
 
 def agree(samples: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the consensus of images; replaces votes by inlier weights, in place.
+    """Estimate the consensus of images: colours [P, 3] float32 in [0, 255], and gains [V, 3] float32.
 
-    Parameters
-    ----------
-    samples : sequence of ndarray [P, 4] uint8
-        For each image the colours of the points and its votes. Afterwards the fourth channel is 0 if the image does not
-        see the point, else the inlier weight scaled to 1 to 255.
-
-    Returns
-    -------
-    colors : ndarray [P, 3] float32
-        Consensus colours in [0, 255].
-    gains : ndarray [V, 3] float32
-        An image shows gain * consensus.
+    An image shows gain * consensus. Each of ``samples`` [P, 4] uint8 has the colours of the points in an image and its
+    votes, which are replaced in place: afterwards the fourth channel is 0 if the image does not see the point, else the
+    inlier weight scaled to 1 to 255.
     """
     count = len(samples[0])
     gains = _gains(np.stack([table[:: -(-count // _GAIN_POINTS)] for table in samples]))
@@ -119,20 +110,11 @@ def corrected(
     gain: np.ndarray,
     cell: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Correct an image to the consensus colours, and return weights [H, W] of its pixels.
+    """Correct an image [H, W, 3 or 4] uint8 to the consensus colours, and return weights [H, W] of its pixels.
 
-    Parameters
-    ----------
-    image : ndarray [H, W, 3 or 4] uint8
-    pixels : ndarray [n, 2] px
-        Positions of points in the image.
-    samples : ndarray [n, 4] uint8
-        As returned by ``agree``.
-    colors : ndarray [n, 3]
-        Consensus colours of the points.
-    gain : ndarray [3]
-    cell : int, px
-        Side of the cells in which weights and offsets are smoothed.
+    ``pixels`` [n, 2] px are positions of points in the image, ``samples`` [n, 4] uint8 those of ``agree``, ``colors``
+    [n, 3] the consensus, ``gain`` [3]. ``cell`` (px) is the side of the cells in which weights and offsets are
+    smoothed.
     """
     height, width = image.shape[:2]
     shape = -(-height // cell), -(-width // cell)

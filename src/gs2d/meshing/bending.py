@@ -14,22 +14,10 @@ PASSES = 40  # of splitting: each halves the longest edges
 def split_edges(
     vertices: np.ndarray, faces: np.ndarray, limit: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Halve edges that are longer than the mean limit of their ends, the longest edge of each face first.
+    """Halve edges that are longer than the mean limit [P] of their ends, the longest edge of each face first.
 
     An edge is split if it is the longest of all its faces, until no edge is too long, so that thin faces do not get
-    thinner.
-
-    Parameters
-    ----------
-    vertices : ndarray [P, 3] float64, world units
-    faces : ndarray [F, 3] int32
-    limit : ndarray [P] float64, world units
-    values : ndarray [P, C] float64
-
-    Returns
-    -------
-    vertices, faces, values : ndarray
-        New vertices come last and have the mean values of their edge.
+    thinner. New vertices come last and have the mean ``values`` [P, C] of their edge. Lengths are world units.
     """
     rows = np.concatenate([vertices, limit[:, None], values], axis=1)
     for _ in range(PASSES):
@@ -66,25 +54,16 @@ def _sides(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """Mean curvature of the vertices of a mesh, and its change with displacements along the normals.
+    """Mean curvature of the vertices of a mesh, and its change with displacements along the normals."""
 
-    Attributes
-    ----------
-    values : ndarray [P], 1 / world unit
-        kappa_k = 2 sum_j w_kj n_k . (x_j - x_k) / sum_j w_kj |x_j - x_k|^2 over neighbours j, w = 1 / |x_j - x_k|.
-        Exact on a sphere; 0 at open borders.
-    change : csr_array [P, P], 1 / world unit^2
-        Derivative of ``values`` by the displacements, with constant normals and weights; neighbours move in parallel.
-    areas : ndarray [P], world units^2
-        A third of the areas of the faces of each vertex.
-    graph : csr_array [P, P]
-        Laplacian of the edges: x . graph x is the sum of (x_i - x_j)^2 over the edges.
-    """
-
+    # [P], 1 / world unit: kappa_k = 2 sum_j w_kj n_k . (x_j - x_k) / sum_j w_kj |x_j - x_k|^2 over neighbours j, w = 1
+    # / |x_j - x_k|. Exact on a sphere; 0 at open borders.
     values: np.ndarray
+    # [P, P], 1 / world unit^2: derivative of ``values`` by the displacements, with constant normals and weights;
+    # neighbours move in parallel.
     change: csr_array
-    areas: np.ndarray
-    graph: csr_array
+    areas: np.ndarray  # [P] a third of the areas of the faces of each vertex, world units^2
+    graph: csr_array  # [P, P] Laplacian of the edges: x . graph x is the sum of (x_i - x_j)^2 over the edges
 
     @classmethod
     def of(cls, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Curvature:
@@ -131,16 +110,7 @@ class Curvature:
 def solve(matrix: csr_array, right: np.ndarray, *, steps: int, tolerance: float) -> np.ndarray:
     """Solve a symmetric positive definite system by conjugate gradients with a diagonal preconditioner.
 
-    The sums do not depend on the number of threads.
-
-    Parameters
-    ----------
-    matrix : csr_array [P, P]
-    right : ndarray [P]
-    steps : int
-        Most iterations.
-    tolerance : float
-        Relative residual to stop at.
+    It stops at the relative residual ``tolerance`` or after ``steps``. The sums do not depend on the number of threads.
     """
     diagonal = matrix.diagonal()
     inverse = 1 / np.where(diagonal > 0, diagonal, 1.0)

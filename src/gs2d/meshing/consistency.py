@@ -25,18 +25,8 @@ _ENOUGH = 100  # residuals needed for an estimate
 def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits: FusionBounds) -> float | None:
     """Return the 75th percentile, in world units, of how much farther views see than their neighbours' points.
 
-    Parameters
-    ----------
-    maps : iterable of DepthMap
-    samples : sequence of DepthSample
-        One for each map, in the same order.
-    limits : FusionBounds
-        Depth limit of the pixels. A slope of more than the largest truncation per pixel is a depth edge.
-
-    Returns
-    -------
-    float or None
-        None if too few points are seen by two views.
+    ``samples`` has one for each map, in the same order. A slope of more than the largest truncation per pixel is a
+    depth edge. None if too few points are seen by two views.
     """
     if not samples:
         return None

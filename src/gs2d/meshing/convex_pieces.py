@@ -16,26 +16,12 @@ FACES = 20_000  # of the mesh that is split; the pieces are coarser
 
 
 def required() -> Any:
-    """Import the package of the extra ``collision``.
-
-    Raises
-    ------
-    BackendError
-        If it is not installed.
-    """
+    """Import the package of the extra ``collision``, or raise BackendError."""
     return extras.required("collision", "coacd", "--collision", "leave --collision out")
 
 
 def convex_pieces(mesh: Mesh) -> list[Mesh]:
-    """Return convex meshes that together fill the volume of a mesh. Open meshes are closed first.
-
-    Raises
-    ------
-    BackendError
-        If the package coacd is missing.
-    ProtocolError
-        If the mesh has no faces.
-    """
+    """Return convex meshes that together fill the volume of a mesh. Open meshes are closed first."""
     coacd = required()
     if not len(mesh.faces):
         raise ProtocolError("--collision needs a mesh with faces, got an empty mesh; extract it with other limits")

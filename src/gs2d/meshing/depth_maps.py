@@ -21,24 +21,14 @@ from gs2d.errors import ShapeError
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """Rendered depth and colour of one view.
-
-    Attributes
-    ----------
-    camera : Camera
-    depth : ndarray or Tensor [H, W] world units
-        Depth along the optical axis at pixel centres. 0, negative values and NaN are invalid. Infinity means that the
-        ray hits no surface, which contradicts any surface on it.
-    color : ndarray or Tensor [H, W, 3] or None
-        uint8, or float in [0, 1].
-    valid : ndarray or Tensor [H, W] or None
-        bool (False for background, masked pixels, alpha < 0.5), or a weight >= 0 for each pixel.
-    """
+    """Rendered depth and colour of one view, as arrays or tensors."""
 
     camera: Camera
+    # [H, W] world units along the optical axis at pixel centres. 0, negative values and NaN are invalid. Infinity means
+    # that the ray hits no surface, which contradicts any surface on it.
     depth: Any
-    color: Any = None
-    valid: Any = None
+    color: Any = None  # [H, W, 3] uint8, or float in [0, 1]
+    valid: Any = None  # [H, W] bool (False for background, masked pixels, alpha < 0.5), or a weight >= 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +44,8 @@ class DepthMap:
 def depth_map(frame: RenderedView) -> DepthMap:
     """Convert a frame to numpy and check it.
 
-    Raises
-    ------
-    ShapeError
-        If depth, colour or mask do not have the size of the camera, or a weight is negative or not finite.
+    Raises ShapeError if depth, colour or mask do not have the size of the camera, or a weight is negative or not
+    finite.
     """
     camera = frame.camera
     depth = _array(frame.depth)
@@ -90,17 +78,7 @@ def _array(value: Any) -> np.ndarray:
 class Spool:
     """Depth maps in an unnamed temporary file, for repeated iteration.
 
-    Parameters
-    ----------
-    frames : iterable of RenderedView
-        Read once, checked and written one by one.
-
-    Raises
-    ------
-    ShapeError
-        If a frame is invalid.
-    DiskError
-        If the file cannot be written.
+    Frames are read once, checked (ShapeError) and written one by one (DiskError).
     """
 
     def __init__(self, frames: Iterable[RenderedView]) -> None:

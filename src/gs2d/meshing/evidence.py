@@ -30,24 +30,12 @@ GRAZING = 0.1  # cosine between ray and surface below which a view does not see 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Support and contradiction of the vertices of a mesh.
+    """Support and contradiction of the vertices of a mesh."""
 
-    Attributes
-    ----------
-    views : ndarray [P] int32
-        Number of views that see the vertex.
-    support : ndarray [P] float32
-        Sum of the weights of the pixels that show it, one per view.
-    against : ndarray [P] float32
-        Sum of the weights of the pixels that see farther.
-    density : ndarray [P] float32
-        Pixels per world unit^2 of surface, in the view with the highest resolution.
-    """
-
-    views: np.ndarray
-    support: np.ndarray
-    against: np.ndarray
-    density: np.ndarray
+    views: np.ndarray  # [P] int32: number of views that see the vertex
+    support: np.ndarray  # [P] float32: sum of the weights of the pixels that show it, one per view
+    against: np.ndarray  # [P] float32: sum of the weights of the pixels that see farther
+    density: np.ndarray  # [P] float32: pixels per world unit^2 of surface, in the view with the highest resolution
 
     def rows(self, rows: np.ndarray | slice) -> Evidence:
         """Return the evidence of some vertices; for a slice, the arrays are views."""
@@ -57,12 +45,7 @@ class Evidence:
 def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
     """Compare a mesh with the depth maps that it was fused from.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    maps : iterable of DepthMap
-    tolerance : float, world units
-        Depths that differ by less belong to one surface.
+    Depths that differ by less than ``tolerance`` (world units) belong to one surface.
     """
     vertices_t, normals_t = mesh.vertices.T, _normals(mesh).T
     parts = [slice(start, start + VERTICES_AT_ONCE) for start in range(0, len(mesh.vertices), VERTICES_AT_ONCE)]
@@ -149,20 +132,8 @@ def pixels(mesh: Mesh, evidence: Evidence) -> float:
 def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float, *, small: float = SMALL) -> tuple[Mesh, float]:
     """Remove surface that the views contradict, and small components that few views see.
 
-    Parameters
-    ----------
-    maps : iterable of DepthMap
-        The maps that the mesh was fused from.
-    tolerance : float
-        As for ``gather``.
-    small : float
-        Components with less than this fraction of the area of the largest one are removed.
-
-    Returns
-    -------
-    mesh : Mesh
-    pixels : float
-        Number of pixels that show the surface, see ``pixels``.
+    ``maps`` and ``tolerance`` as of ``gather``. Components with less than the fraction ``small`` of the area of the
+    largest one are removed. Also returns the number of pixels that show the surface, see ``pixels``.
     """
     evidence = gather(mesh, maps, tolerance)
     mesh, evidence = large_components(*supported(mesh, evidence), small)

@@ -42,44 +42,23 @@ class Extraction:
 
 @dataclass(frozen=True, eq=False)
 class ExtractOptions:
-    """Settings of the extraction. Limits that are None are derived from the depth maps.
+    """Settings of the extraction. Limits that are None are derived from the depth maps."""
 
-    Attributes
-    ----------
-    resolution : int
-        Voxels along the longest side, see ``derive_limits``.
-    bbox : array [2, 3] world units or None
-        Box to fuse; faces outside are removed. For an unbounded scene, the innermost level.
-    voxel, truncation, depth_limit : float world units or None
-        The derived truncation grows with the disagreement of the depth maps (``consistency.depth_noise``).
-    min_weight : float
-        See ``cell_surface``.
-    keep : int or None
-        Number of components to keep, see ``keep_components``.
-    by_evidence : bool
-        Keep only surface that more views see than see through (``evidence.clean``). Not for unbounded scenes.
-    error : float, px
-        Simplify with this error, see ``simplify``; 0 keeps all faces.
-    watertight : bool
-        Close the surface everywhere, also where no view shows it (``extract_delaunay`` alone).
-    max_bytes : int
-        Limit of the volume.
-    slab_bytes : int
-        Part of the volume that is in memory at a time; the mesh does not depend on it.
-    """
-
-    resolution: int = 512
+    resolution: int = 512  # voxels along the longest side, see ``derive_limits``
+    # [2, 3] world units: box to fuse; faces outside are removed. For an unbounded scene, the innermost level.
     bbox: np.ndarray | None = None
-    voxel: float | None = None
+    voxel: float | None = None  # world units, as the two below
+    # derived, it grows with the disagreement of the depth maps (``consistency.depth_noise``)
     truncation: float | None = None
     depth_limit: float | None = None
-    min_weight: float = 1.0
-    keep: int | None = None
+    min_weight: float = 1.0  # see ``cell_surface``
+    keep: int | None = None  # number of components to keep, see ``keep_components``
+    # Keep only surface that more views see than see through (``evidence.clean``). Not for unbounded scenes.
     by_evidence: bool = False
-    error: float = 0.0
-    watertight: bool = False
-    max_bytes: int = 4 << 30
-    slab_bytes: int = SLAB_BYTES
+    error: float = 0.0  # px: simplify with this error, see ``simplify``; 0 keeps all faces
+    watertight: bool = False  # close the surface everywhere, also where no view shows it (Delaunay alone)
+    max_bytes: int = 4 << 30  # limit of the volume
+    slab_bytes: int = SLAB_BYTES  # part of the volume that is in memory at a time; the mesh does not depend on it
 
     @property
     def limits(self) -> dict[str, Any]:
@@ -97,25 +76,10 @@ def extract(
 ) -> Extraction:
     """Fuse depth maps into a mesh.
 
-    Parameters
-    ----------
-    frames : iterable of RenderedView
-        Read once (it may be a generator) and stored in a temporary file.
-    options : ExtractOptions
-    threads : int, optional
-    backend : str or Backend
-        Backend of the fusion, see ``fuse_blocks``.
-
-    Raises
-    ------
-    ProtocolError
-        If there is nothing to fuse, a limit is invalid, or the volume would exceed ``max_bytes``.
-    ShapeError
-        If the maps of a frame do not have the size of its camera.
-    DiskError
-        If the temporary file cannot be written.
-    BackendError
-        If the backend is unknown or cannot run here.
+    ``frames`` are read once (it may be a generator) and stored in a temporary file. The backend is that of the fusion,
+    see ``fuse_blocks``. Raises ProtocolError if there is nothing to fuse, a limit is invalid, or the volume would
+    exceed ``max_bytes``; ShapeError if the maps of a frame do not have the size of its camera; DiskError if the
+    temporary file cannot be written; BackendError if the backend is unknown or cannot run here.
     """
     backend = fusion_backend(backend)
     spool, samples = spooled(frames, threads)

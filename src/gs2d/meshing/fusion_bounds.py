@@ -27,37 +27,19 @@ NOISE_PER_TRUNCATION = 20.0  # times the depth noise: averaging depth maps that 
 
 @dataclass(frozen=True)
 class FusionBounds:
-    """Limits of one fusion, and the statistics they are derived from, as plain numbers for JSON.
+    """Limits of one fusion, and the statistics they are derived from, as plain numbers for JSON (world units)."""
 
-    Attributes
-    ----------
-    lower, upper : tuple of 3 floats, world units
-        Corners of the fused box.
-    side : float, world units
-        Longest side of the box of the 1st to 99th percentile of the points, or of the requested box.
-    voxel, truncation, depth_limit : float, world units
-        Depths beyond ``depth_limit`` are ignored.
-    depth_median, depth_high : float, world units
-        Median and 99.5th percentile of all depths.
-    pixel_footprint : float, world units
-        Median width of a pixel on the surface.
-    cut_fraction : float
-        Fraction of the valid pixels outside depth limit or box. Large if a background is not fused.
-    depth_noise : float or None, world units
-        Disagreement of neighbouring views (``consistency.depth_noise``), if it was measured.
-    """
-
-    lower: tuple[float, float, float]
+    lower: tuple[float, float, float]  # of the fused box
     upper: tuple[float, float, float]
-    side: float
+    side: float  # longest side of the box of the 1st to 99th percentile of the points, or of the requested box
     voxel: float
     truncation: float
-    depth_limit: float
-    depth_median: float
-    depth_high: float
-    pixel_footprint: float
-    cut_fraction: float
-    depth_noise: float | None = None
+    depth_limit: float  # depths beyond are ignored
+    depth_median: float  # of all depths
+    depth_high: float  # 99.5th percentile of all depths
+    pixel_footprint: float  # median width of a pixel on the surface
+    cut_fraction: float  # of the valid pixels outside depth limit or box; large if a background is not fused
+    depth_noise: float | None = None  # disagreement of neighbouring views, if it was measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,24 +80,12 @@ def derive_limits(
     truncation: float | None = None,
     depth_limit: float | None = None,
 ) -> FusionBounds:
-    """Derive the limits from samples of all views; requested limits override derived ones.
+    """Derive the limits from samples of all views; requested limits (world units) override derived ones.
 
-    Parameters
-    ----------
-    samples : iterable of DepthSample
-        One for each view.
-    cameras : sequence of Camera
-    resolution : int
-        Voxels along the longest side of the box of the 1st to 99th percentile of the points. The voxel is at least
-        half the median width of a pixel on the surface: smaller voxels contain only interpolation.
-    bbox : array [2, 3] world units, optional
-        Fuse this box: it also sets the voxel, and the depth limit includes its farthest corner.
-    voxel, truncation, depth_limit : float world units, optional
-
-    Raises
-    ------
-    ProtocolError
-        If no pixel has a depth, or a requested limit is invalid.
+    ``resolution`` is the number of voxels along the longest side of the box of the 1st to 99th percentile of the
+    points. The voxel is at least half the median width of a pixel on the surface: smaller voxels contain only
+    interpolation. With ``bbox`` [2, 3] this box is fused: it also sets the voxel, and the depth limit includes its
+    farthest corner. Raises ProtocolError if no pixel has a depth, or a requested limit is invalid.
     """
     picked = list(samples)
     xyz = np.concatenate([s.points for s in picked]) if picked else np.zeros((0, 3))

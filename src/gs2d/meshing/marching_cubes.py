@@ -115,25 +115,14 @@ _EDGE_GUARD = np.float32(1e-3)  # of an edge: distance of vertices from its ends
 def cell_surface(
     volume: Volume, min_weight: float, blocks: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the topology of the zero level set of a volume.
+    """Return the topology of the zero level set of the first ``blocks`` blocks of a volume (default: all).
 
-    Parameters
-    ----------
-    volume : Volume
-    min_weight : float
-        Voxels with a lower weight are unknown. A view adds 1 to voxels in front of its surface, and to those behind it
-        up to ``FULL_WEIGHT_BEHIND`` of the truncation.
-    blocks : int, optional
-        Process the first ``blocks`` blocks only (default: all).
+    Voxels with a weight below ``min_weight`` are unknown. A view adds 1 to voxels in front of its surface, and to those
+    behind it up to ``FULL_WEIGHT_BEHIND`` of the truncation.
 
-    Returns
-    -------
-    edges : ndarray [P] int64
-        Sorted grid edges with a vertex: 3 * (512 * row + voxel) + axis, of the voxel at the lower end.
-    faces : ndarray [F, 3]
-        Indices into ``edges``, counter-clockwise seen from the cameras' side.
-    ends : ndarray [P] int64
-        Voxel at the upper end of each edge, as 512 * row + voxel; larger than that of the lower end.
+    Returns the P sorted grid edges with a vertex, int64: 3 * (512 * row + voxel) + axis, of the voxel at the lower end;
+    faces [F, 3] of indices into them, counter-clockwise seen from the cameras' side; and the voxel at the upper end of
+    each edge [P], as 512 * row + voxel, larger than that of the lower end.
     """
     count = len(volume.keys) if blocks is None else blocks
     shifted = _neighbours(volume)

@@ -12,24 +12,16 @@ from gs2d.errors import ProtocolError
 
 @dataclass(frozen=True)
 class MeshMethod:
-    """A method of mesh extraction.
+    """A method of mesh extraction."""
 
-    Attributes
-    ----------
-    extract : callable
-        Has the signature of ``gs2d.meshing.extract.extract``.
-    bounded : bool
-        False: it meshes everything instead of the subject; a box of the user is that of the finest detail.
-    """
-
-    extract: Callable[..., Any]
-    bounded: bool = True
+    extract: Callable[..., Any]  # has the signature of ``gs2d.meshing.extract.extract``
+    bounded: bool = True  # False: meshes everything instead of the subject; a box is that of the finest detail
 
 
 MESH_METHODS: Registry[MeshMethod] = Registry(
     "mesh method",
     "gs2d.mesh_methods",
-    builtin={"tsdf": "gs2d.meshing.extract", "delaunay": "gs2d.meshing.delaunay"},
+    builtin={"tsdf": "gs2d.meshing.extract"},
     error=ProtocolError,
 )
 """Methods of mesh extraction, by name."""

@@ -23,20 +23,13 @@ _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """The nearest triangle along each ray of a camera.
+    """The nearest triangle along each ray of a camera."""
 
-    Attributes
-    ----------
-    face : ndarray [H, W] int32
-        Index of the triangle; -1 without a hit.
-    depth : ndarray [H, W] float32 world units
-        Along the optical axis (not along the ray); 0 without a hit.
-    weights : ndarray [H, W, 3] float32
-        Barycentric coordinates of the hit; 0 without a hit.
-    """
-
+    # int32 index of the triangle; -1 without a hit
     face: np.ndarray  # [H, W]
+    # float32 along the optical axis (not along the ray); 0 without a hit
     depth: np.ndarray  # [H, W] world units
+    # float32 barycentric coordinates of the hit; 0 without a hit
     weights: np.ndarray  # [H, W, 3]
 
 
@@ -50,20 +43,8 @@ def cast_camera(
     coordinates of the hit, and depth = a.(b x c) / sum if d has unit z (Cramer's rule). Triangles are two-sided.
     Adjacent triangles evaluate their common edge with exactly opposite values, so no ray passes between them.
 
-    Parameters
-    ----------
-    vertices : ndarray [P, 3] world units
-    faces : ndarray [F, 3] int
-    camera : Camera
-    samples : int
-        Rays per pixel along each axis, at the centres of equal sub-pixels.
-    near : float, world units
-        Hits at a smaller depth are ignored.
-
-    Returns
-    -------
-    Hits
-        Of size [height * samples, width * samples].
+    Rays are at the centres of equal sub-pixels; hits at a depth below ``near`` (world units) are ignored. The result
+    has the size [height * samples, width * samples].
     """
     width, height = camera.width * samples, camera.height * samples
     local = vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]  # [P, 3] in camera axes
@@ -108,11 +89,7 @@ def cast_camera(
 def outlines(depth: np.ndarray, focal: float) -> np.ndarray:
     """Return the pixels at outlines, [H, W] bool: where 1 / depth, which is linear on a plane, bends.
 
-    Parameters
-    ----------
-    depth : ndarray [H, W] world units
-        0 without a surface.
-    focal : float, px
+    The depth [H, W] is 0 without a surface; ``focal`` in px.
     """
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
     bend = np.zeros_like(inverse)

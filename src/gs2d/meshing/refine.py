@@ -78,55 +78,27 @@ ReadGrey = Callable[[int, int], GreyImage]
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """How a mesh is refined.
+    """How a mesh is refined."""
 
-    Attributes
-    ----------
-    factors : tuple of int
-        The photographs are downscaled by these factors, one after the other. Empty: down to a shorter side of
-        ``COARSE_SIDE``.
-    steps : int
-        Gauss-Newton steps at each of them.
-    neighbours : int
-        Views that each view is compared with, at most.
-    face_pixels : float
-        Mean number of pixels of a face after simplification.
-    split_pixels : float
-        Number of pixels of the largest faces.
-    match : MatchSettings
-    """
-
+    # The photographs are downscaled by these, one after the other. Empty: down to a shorter side of ``COARSE_SIDE``.
     factors: tuple[int, ...] = ()
-    steps: int = 6
-    neighbours: int = 3
-    face_pixels: float = 1.5
-    split_pixels: float = 6.0
+    steps: int = 6  # Gauss-Newton steps at each of them
+    neighbours: int = 3  # views that each view is compared with, at most
+    face_pixels: float = 1.5  # mean number of pixels of a face after simplification
+    split_pixels: float = 6.0  # number of pixels of the largest faces
     match: MatchSettings = field(default_factory=MatchSettings)
 
 
 @dataclass(frozen=True, eq=False)
 class _Moving:
-    """Vertices, and what moves with them.
+    """Vertices, and what moves with them."""
 
-    Attributes
-    ----------
-    vertices, start : ndarray [P, 3] float64, world units
-        Where they are, and where they were.
-    faces : ndarray [F, 3] int32
-    size : ndarray [P] float64, world units
-        Size of a full pixel on the surface.
-    matt : ndarray [P] float64, from 0 to 1
-        Factor of w: 0 on shiny surface.
-    kept : ndarray [P] float64, from 0 to 1
-        Share of its move that a vertex keeps in the end.
-    """
-
-    vertices: np.ndarray
-    start: np.ndarray
-    faces: np.ndarray
-    size: np.ndarray
-    matt: np.ndarray
-    kept: np.ndarray
+    vertices: np.ndarray  # [P, 3] float64, world units
+    start: np.ndarray  # where they were
+    faces: np.ndarray  # [F, 3] int32
+    size: np.ndarray  # [P] float64: size of a full pixel on the surface, world units
+    matt: np.ndarray  # [P] float64, from 0 to 1: factor of w: 0 on shiny surface
+    kept: np.ndarray  # [P] float64, from 0 to 1: share of its move that a vertex keeps in the end
 
     def normals(self) -> np.ndarray:
         """Return unit normals [P, 3]."""
@@ -148,24 +120,7 @@ ComparedView = tuple[GreyImage, DrawnMesh, Sequence[tuple[GreyImage, np.ndarray]
 
 
 class Refinement:
-    """A mesh under refinement.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Not changed.
-    cameras : sequence of Camera
-        Of the photographs at full size.
-    photographs : callable
-        Reads a photograph in grey.
-    settings : RefineSettings
-    library : Library
-
-    Attributes
-    ----------
-    work : int
-        The last number that ``on_work`` receives.
-    """
+    """A mesh under refinement, which is not changed; the cameras are those of the photographs at full size."""
 
     def __init__(
         self,
@@ -188,17 +143,9 @@ class Refinement:
         return (max(self._factors) // factor) ** 2
 
     def run(self, on_work: Callable[[int], None]) -> Mesh:
-        """Refine the mesh.
+        """Refine the mesh, which gets the colours of the nearest vertices of the input.
 
-        Parameters
-        ----------
-        on_work : callable
-            Receives the amount of work that is done.
-
-        Returns
-        -------
-        Mesh
-            With the colours of the nearest vertices of the input.
+        ``on_work`` receives the amount of work that is done; ``work`` is the last number that it receives.
         """
         mesh = Mesh(self._mesh.vertices.astype(np.float64), self._mesh.faces)
         settings, count = self._settings, pixels(mesh, self._seen(mesh))

@@ -36,16 +36,9 @@ PULL = 1e-3  # of the trace of A, towards the middle of the edge: places x where
 def simplify(mesh: Mesh, *, error: float = math.inf, cameras: Sequence[Camera] = (), faces: int = 0) -> Mesh:
     """Simplify a mesh to an error in pixels, or to a number of faces, whichever is reached first.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        Vertices get the mean colour of the surface that they replace.
-    error : float
-        Root mean square distance from the surface, px of the nearest image, that collapses may cause.
-    cameras : sequence of Camera
-        Of the images. Without any, the longest side of the mesh has 1000 px.
-    faces : int
-        Stop at this number of faces.
+    ``error`` is the root mean square distance from the surface, px of the nearest image, that collapses may cause;
+    without cameras the longest side of the mesh has 1000 px. Vertices get the mean colour of the surface that they
+    replace.
     """
     if len(mesh.faces) <= max(faces, 4) or error <= 0:
         return mesh

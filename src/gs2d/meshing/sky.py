@@ -20,21 +20,11 @@ ALIKE = 0.05  # colour difference, [0, 1], up to which pixels at the edge of an 
 
 
 def sky_pixels(image: np.ndarray, points: np.ndarray, above: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-    """Find large smooth areas without sparse points, above the horizon and at the border of an image.
+    """Find large smooth areas without sparse points, above the horizon and at the border of an image, [H, W] bool.
 
-    Parameters
-    ----------
-    image : ndarray [H, W, 3] float in [0, 1]
-    points : ndarray [M, 2] px
-        Projections of all sparse points in the image.
-    above : ndarray [H, W] bool
-        Pixels whose rays point above the horizon.
-    valid : ndarray [H, W] bool, optional
-        Pixels with content; undistortion may leave empty wedges, whose edges count as border.
-
-    Returns
-    -------
-    ndarray [H, W] bool
+    The image [H, W, 3] is float in [0, 1]; ``points`` [M, 2] px are projections of all sparse points; ``above`` [H, W]
+    says which rays point above the horizon. ``valid`` [H, W] are pixels with content: undistortion may leave empty
+    wedges, whose edges count as border.
     """
     factor = max(1, round(max(image.shape[:2]) / SIDE))
     shown = np.ones(image.shape[:2], bool) if valid is None else valid

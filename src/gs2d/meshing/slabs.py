@@ -32,19 +32,9 @@ def fused_surface(
 ) -> Mesh:
     """Fuse depth maps and extract their surface, without the whole volume in memory.
 
-    Parameters
-    ----------
-    frames : iterable of DepthMap
-        Read once for each slab: a sequence or a ``Spool``.
-    limits : FusionBounds
-    blocks : VolumeBlocks
-        From ``find_blocks``.
-    min_weight : float
-        See ``cell_surface``.
-    slab_bytes : int
-        Limit for a slab; exceeded only if a single layer of blocks and the next one do not fit.
-    backend
-        As for ``fuse_blocks``.
+    ``frames`` are read once for each slab: a sequence or a ``Spool``. ``blocks`` are from ``find_blocks``;
+    ``min_weight`` as of ``cell_surface``, the backend as of ``fuse_blocks``. ``slab_bytes`` is exceeded only if a
+    single layer of blocks and the next one do not fit.
     """
     edges: list[np.ndarray] = []
     vertices: list[np.ndarray] = []

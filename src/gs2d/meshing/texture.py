@@ -44,47 +44,23 @@ _BAND = 1 << 20  # texels per chunk
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """A mesh whose vertices are split along the seams of a texture.
+    """A mesh whose vertices are split along the seams of a texture."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        The mesh before the split.
-    source : ndarray [Q] int64
-        Vertex of ``mesh`` of each split vertex.
-    faces : ndarray [F, 3] int32
-        Indices of split vertices; face f is face f of ``mesh``.
-    uv : ndarray [Q, 2] float32
-        Texture coordinates in [0, 1], from the upper left corner.
-    charts : int
-    """
-
-    mesh: Mesh
-    source: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray
+    mesh: Mesh  # before the split
+    source: np.ndarray  # [Q] int64: vertex of ``mesh`` of each split vertex
+    faces: np.ndarray  # [F, 3] int32 indices of split vertices; face f is face f of ``mesh``
+    uv: np.ndarray  # [Q, 2] float32 texture coordinates in [0, 1], from the upper left corner
     charts: int
 
 
 @dataclass(frozen=True, eq=False)
 class Texels:
-    """The T texels of a texture that lie on the mesh, row by row.
+    """The T texels of a texture that lie on the mesh, row by row."""
 
-    Attributes
-    ----------
-    size : int
-        Texels in a row.
-    index : ndarray [T] int32
-        row * size + column.
-    face : ndarray [T] int32
-    weights : ndarray [T, 2] float32
-        Barycentric coordinates of the texel's centre for the first two corners of its face.
-    """
-
-    size: int
-    index: np.ndarray
-    face: np.ndarray
-    weights: np.ndarray
+    size: int  # texels in a row
+    index: np.ndarray  # [T] int32: row * size + column
+    face: np.ndarray  # [T] int32
+    weights: np.ndarray  # [T, 2] float32: barycentric coordinates of the texel's centre for two corners of its face
 
     def interpolated(self, values: np.ndarray, faces: np.ndarray, part: slice = slice(None)) -> np.ndarray:
         """Interpolate vertex values [P, C] at the texels of ``part``, float32 [t, C]."""
@@ -98,13 +74,7 @@ class Texels:
 
 
 def required(module: str) -> Any:
-    """Import a package of the extra ``texture``.
-
-    Raises
-    ------
-    BackendError
-        If it is not installed.
-    """
+    """Import a package of the extra ``texture``, or raise BackendError."""
     return extras.required("texture", module, "--texture", "leave --texture out")
 
 
@@ -116,12 +86,7 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
 def unwrap(mesh: Mesh, size: int) -> Atlas:
     """Split a mesh into charts and pack them into the unit square, ``PADDING`` texels apart at this ``size``.
 
-    Raises
-    ------
-    BackendError
-        If the package xatlas is missing.
-    ProtocolError
-        If the mesh has no faces.
+    Raises BackendError if the package xatlas is missing, ProtocolError if the mesh has no faces.
     """
     xatlas = required("xatlas")
     if not len(mesh.faces):
@@ -186,20 +151,11 @@ TABLE_BYTES = 512 << 20  # limit for the colours of these points in all images
 
 @dataclass(frozen=True, eq=False)
 class ColorSource:
-    """An image to take colours from.
-
-    Attributes
-    ----------
-    camera : Camera
-    image : ndarray [H, W, 3 or 4] uint8
-        Straight alpha; pixels with alpha below one half are ignored.
-    valid : ndarray [H, W] bool or None
-        False for pixels to ignore.
-    """
+    """An image to take colours from."""
 
     camera: Camera
-    image: np.ndarray
-    valid: np.ndarray | None = None
+    image: np.ndarray  # [H, W, 3 or 4] uint8, straight alpha; pixels with alpha below one half are ignored
+    valid: np.ndarray | None = None  # [H, W] bool, False for pixels to ignore
 
     def shrunk(self, factor: int) -> ColorSource:
         """Downscale by averaging ``factor`` x ``factor`` pixels."""
@@ -248,23 +204,10 @@ def texture_size(mesh: Mesh, cameras: list[Camera]) -> int:
 
 
 def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, threads: int | None = None) -> Baked:
-    """Colour the texels of an atlas from images.
+    """Colour the texels of an atlas from images, which are read twice; ProtocolError if none sees the surface.
 
-    Parameters
-    ----------
-    atlas : Atlas
-    images : callable
-        Reads the images; called twice.
-    size : int, texels
-        Side of the texture. Needs about 70 bytes of memory per texel on the surface.
-    best : int
-        Number of images that contribute to a texel.
-    threads : int, optional
-
-    Raises
-    ------
-    ProtocolError
-        If no image sees the surface.
+    ``size`` is the side of the texture, which needs about 70 bytes of memory per texel on the surface; ``best`` is the
+    number of images that contribute to a texel.
     """
     texels = texels_of(atlas, size)
     colors, seen = surface_colors(atlas.mesh, texels, images, best=best, threads=threads)
@@ -282,23 +225,9 @@ def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, thr
 def surface_colors(
     mesh: Mesh, texels: Texels, images: ColorSources, *, best: int = BEST, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours [T, 3] uint8 of points on a mesh from images, and which points any image sees [T].
+    """Return colours [T, 3] uint8 of points on the faces of a mesh, and which points any image sees [T].
 
-    Parameters
-    ----------
-    mesh : Mesh
-    texels : Texels
-        Points on the faces of the mesh.
-    images : callable
-        Reads the images; called twice.
-    best : int
-        Number of images that contribute to a colour.
-    threads : int, optional
-
-    Raises
-    ------
-    ProtocolError
-        If no image sees any point.
+    Parameters and errors are those of ``bake``.
     """
     origin = mesh.vertices.astype(np.float64).mean(axis=0)
     points = _Points.of(mesh, texels, origin)
@@ -430,15 +359,8 @@ class _Looked:
     def see(self, points: _Points, least: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the visible points with a score above ``least`` [n].
 
-        Returns
-        -------
-        rows : ndarray [m] int64
-        density : ndarray [m]
-            q, pixels per unit of surface.
-        clear : ndarray [m]
-            b, factor for the distance from an outline.
-        cosine : ndarray [m]
-        colors : ndarray [m, 3]
+        Returns their rows [m] int64, pixels per unit of surface (q) [m], factors for the distance from an outline (b)
+        [m], cosines [m] and colours [m, 3].
         """
         facing = points.normals @ self._center - points.heights
         z = points.positions @ self._rotation[2] + self._shift[2]

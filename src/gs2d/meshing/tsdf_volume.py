@@ -33,30 +33,16 @@ MAX_BLOCKS = 2**30  # of a box; finding the touched ones takes up to a byte for 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """The fused field. Voxel (i, j, k) of block b is the point ``lower + (8 blocks[b] + (i, j, k)) * voxel``.
-
-    Attributes
-    ----------
-    limits : FusionBounds
-    dims : tuple of 3 ints
-        Size of the box in blocks along x, y, z.
-    keys : ndarray [M] int64
-        Sorted: (x * dims[1] + y) * dims[2] + z of each block.
-    tsdf : ndarray [M, 512] float32
-        In units of the truncation, positive towards the cameras; voxels in x, y, z order, z fastest.
-    weight : ndarray [M, 512] float32
-        0 means unknown.
-    color, color_weight : ndarray [M, 512, 3] and [M, 512] float32, or None
-        0 to 255, from views with a surface near the voxel.
-    """
+    """The fused field. Voxel (i, j, k) of block b is the point ``lower + (8 blocks[b] + (i, j, k)) * voxel``."""
 
     limits: FusionBounds
-    dims: tuple[int, int, int]
-    keys: np.ndarray
+    dims: tuple[int, int, int]  # size of the box in blocks along x, y, z
+    keys: np.ndarray  # [M] int64, sorted: (x * dims[1] + y) * dims[2] + z of each block
+    # [M, 512] float32 in units of the truncation, positive towards the cameras; voxels in x, y, z order, z fastest
     tsdf: np.ndarray
-    weight: np.ndarray
-    color: np.ndarray | None
-    color_weight: np.ndarray | None
+    weight: np.ndarray  # [M, 512] float32; 0 means unknown
+    color: np.ndarray | None  # [M, 512, 3] float32, 0 to 255, from views with a surface near the voxel
+    color_weight: np.ndarray | None  # [M, 512] float32
 
     @property
     def blocks(self) -> np.ndarray:
@@ -93,13 +79,7 @@ def check_truncation(limits: FusionBounds) -> None:
 
 
 def block_grid(limits: FusionBounds) -> tuple[int, int, int]:
-    """Return the size of the box in blocks along x, y, z.
-
-    Raises
-    ------
-    ProtocolError
-        If the box has more than ``MAX_BLOCKS`` blocks.
-    """
+    """Return the size of the box in blocks along x, y, z; ProtocolError if it has more than ``MAX_BLOCKS``."""
     size = np.subtract(limits.upper, limits.lower)
     dims = np.ceil(size / (BLOCK * limits.voxel)) + 1
     if not np.isfinite(dims).all() or np.prod(dims) > MAX_BLOCKS:
@@ -150,13 +130,7 @@ Add = Callable[[DepthSampler], None]
 
 
 def fusion_backend(backend: str | Backend) -> Backend:
-    """Return the backend of the fusion: "cpu" for "auto", and for a backend without fusion of its own.
-
-    Raises
-    ------
-    BackendError
-        If the name is unknown or the backend cannot run here.
-    """
+    """Return the backend of the fusion: "cpu" for "auto", and for a backend without fusion of its own."""
     chosen = get_backend("cpu" if backend == "auto" else backend) if isinstance(backend, str) else backend
     return get_backend("cpu") if chosen.fusion() is None else chosen
 
@@ -183,12 +157,8 @@ def _changed(volume: Volume, view: DepthSampler) -> dict[str, np.ndarray | None]
 def integrator(volumes: Sequence[Volume], device: FusionOnDevice | None) -> Iterator[Add]:
     """Yield a function that adds a view to volumes, which hold the result at the end.
 
-    Parameters
-    ----------
-    volumes : sequence of Volume
-    device : FusionOnDevice or None
-        A GPU, where the volumes stay until the end; None: the native CPU library, with its number of threads, on which
-        the result does not depend.
+    On a GPU (``device``) the volumes stay there until the end. Without one it is the native CPU library, with its
+    number of threads, on which the result does not depend.
     """
 
     def placed(arrays: dict[str, np.ndarray | None]) -> dict[str, Any]:
@@ -234,19 +204,11 @@ def _volume_arrays(volume: Volume) -> dict[str, np.ndarray | None]:
 
 @dataclass(frozen=True, eq=False)
 class VolumeBlocks:
-    """The blocks near the surfaces of depth maps.
-
-    Attributes
-    ----------
-    dims, keys
-        As in ``Volume``.
-    colored : bool
-        Whether a depth map has colour.
-    """
+    """The blocks near the surfaces of depth maps; ``dims`` and ``keys`` as in ``Volume``."""
 
     dims: tuple[int, int, int]
     keys: np.ndarray
-    colored: bool
+    colored: bool  # whether a depth map has colour
 
     @property
     def nbytes(self) -> int:
@@ -266,18 +228,8 @@ def find_blocks(
 ) -> VolumeBlocks:
     """Find the blocks to fuse.
 
-    Parameters
-    ----------
-    frames : iterable of DepthMap
-    limits : FusionBounds
-    max_bytes : int
-        Limit of the volume.
-
-    Raises
-    ------
-    ProtocolError
-        If the blocks near the surface need more than ``max_bytes`` (the message suggests a voxel), the truncation
-        exceeds the box, or no depth is inside the limits.
+    Raises ProtocolError if the blocks near the surface need more than ``max_bytes`` (the message suggests a voxel), the
+    truncation exceeds the box, or no depth is inside the limits.
     """
     check_truncation(limits)
     dims = block_grid(limits)

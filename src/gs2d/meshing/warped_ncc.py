@@ -46,104 +46,54 @@ DARK = 0.02  # grey value below which the brightness of two images is not compar
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """How two images are compared.
+    """How two images are compared."""
 
-    Attributes
-    ----------
-    radius : int, px
-        A window has 2 radius + 1 pixels a side.
-    texture : float
-        Variance of grey in [0, 1] that counts as noise.
-    poor, good : float
-        The trust in a window rises from 0 to 1 between these NCCs.
-    occluded : float
-        A point is visible in the neighbour if its depth there differs by less than this fraction.
-    grazing : float
-        Cosine between ray and face below which a pixel moves nothing.
-    """
-
-    radius: int = 2
-    texture: float = 2e-4
-    poor: float = 0.5
+    radius: int = 2  # px: a window has 2 radius + 1 pixels a side
+    texture: float = 2e-4  # variance of grey in [0, 1] that counts as noise
+    poor: float = 0.5  # the trust in a window rises from 0 to 1 between these NCCs
     good: float = 0.9
-    occluded: float = 0.01
-    grazing: float = 0.2
+    occluded: float = 0.01  # A point is visible in the neighbour if its depth there differs by less than this fraction.
+    grazing: float = 0.2  # cosine between ray and face below which a pixel moves nothing
 
 
 @dataclass(frozen=True, eq=False)
 class GreyImage:
-    """A photograph in grey.
-
-    Attributes
-    ----------
-    camera : Camera
-    grey : ndarray [H, W] float, in [0, 1]
-    usable : ndarray [H, W] bool or None
-        False for pixels to ignore.
-    """
+    """A photograph in grey."""
 
     camera: Camera
-    grey: np.ndarray
-    usable: np.ndarray | None = None
+    grey: np.ndarray  # [H, W] float, in [0, 1]
+    usable: np.ndarray | None = None  # [H, W] bool, False for pixels to ignore
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnMesh:
-    """A mesh in an image.
+    """A mesh in an image."""
 
-    Attributes
-    ----------
-    face : ndarray [H, W] int32
-        The nearest face at each pixel centre; -1 without one.
-    depth : ndarray [H, W] float, world units
-        0 without a face.
-    """
-
-    face: np.ndarray
-    depth: np.ndarray
+    face: np.ndarray  # [H, W] int32: the nearest face at each pixel centre; -1 without one
+    depth: np.ndarray  # [H, W] float, world units; 0 without a face
 
     def inner(self, focal: float) -> np.ndarray:
-        """Return the pixels [H, W] that show the surface away from outlines, where photographs mix two surfaces.
-
-        Parameters
-        ----------
-        focal : float, px
-        """
+        """Return the pixels [H, W] that show the surface away from outlines, where photographs mix two surfaces."""
         edge = (self.depth <= 0) | outlines(self.depth, focal)
         return ~binary_dilation(edge, np.ones((3, 3), bool), iterations=OUTLINE)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh whose vertices move along unit normals.
+    """A mesh whose vertices move along unit normals."""
 
-    Attributes
-    ----------
-    vertices : ndarray [P, 3] float64 world units
-    faces : ndarray [F, 3] int32
-    normals : ndarray [P, 3] float64
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    normals: np.ndarray
+    vertices: np.ndarray  # [P, 3] float64 world units
+    faces: np.ndarray  # [F, 3] int32
+    normals: np.ndarray  # [P, 3] float64
 
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """Derivative and curvature of the energy, by the depth of each pixel or by the distance of vertices along normals.
+    """Derivatives of the energy, by the depth of each pixel or by the distance of vertices along normals."""
 
-    Attributes
-    ----------
-    gradient, curvature : ndarray [H, W] or [P] float
-        By world units, and by their square.
-    sums : ndarray [2] float64
-        Of w (1 - NCC) and of w; of pixels alone.
-    """
-
-    gradient: np.ndarray
-    curvature: np.ndarray
-    sums: np.ndarray
+    gradient: np.ndarray  # [H, W] or [P] float, by world units
+    curvature: np.ndarray  # by their square
+    sums: np.ndarray  # [2] float64 of w (1 - NCC) and of w; of pixels alone
 
     @classmethod
     def zeros(cls, shape: int | tuple[int, ...], dtype: np.dtype[Any] | type | str = np.float64) -> Pull:
@@ -152,15 +102,7 @@ class Pull:
 
 
 def draw_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera, library: Library) -> DrawnMesh:
-    """Draw the depth of a mesh.
-
-    Parameters
-    ----------
-    vertices : ndarray [P, 3] float64 world units
-    faces : ndarray [F, 3] int32
-    camera : Camera
-    library : Library
-    """
+    """Draw the depth of a mesh of vertices [P, 3] float64 (world units) and faces [F, 3] int32."""
     return DrawnMesh(*draw_on_cpu(library, vertices, faces, camera, NEAR))
 
 
@@ -175,20 +117,9 @@ def match_views(
 ) -> np.ndarray:
     """Compare a view with a neighbour and add the derivatives by the depth of its pixels to ``into``.
 
-    Parameters
-    ----------
-    view, other : GreyImage
-    depth, other_depth : ndarray [H, W], [h, w] world units
-        Depth of the mesh in both; 0 without a surface.
-    settings : MatchSettings
-    into : Pull
-    library : Library
-        The arrays have its precision.
-
-    Returns
-    -------
-    ndarray [7, H, W]
-        The workspace, with the warped neighbour at ``WARPED`` and where it is visible at ``VISIBLE``.
+    ``depth`` [H, W] and ``other_depth`` [h, w] are the depth of the mesh in both, world units, 0 without a surface. The
+    arrays have the precision of the library. Returns the workspace [7, H, W], with the warped neighbour at ``WARPED``
+    and where it is visible at ``VISIBLE``.
     """
     motion = other.camera.T_cam_world @ np.linalg.inv(view.camera.T_cam_world)
     dtype = f"f{library.dtype.itemsize}"
@@ -235,21 +166,9 @@ def brightness_share(
     direction of view: a reflection, whose texture is not on the surface. Of the means over ``SPAN``, the lower median
     over the neighbours counts, because people who walk by are brighter or darker in some of them only.
 
-    Parameters
-    ----------
-    view : GreyImage
-    depth : ndarray [H, W] world units
-        Depth of the surface; 0 without one.
-    neighbours : sequence of (GreyImage, ndarray)
-        Other images, and the depth of the surface in them.
-    settings : MatchSettings
-    library : Library
-
-    Returns
-    -------
-    share, weight, compared : ndarray [H, W] float64
-        The weight is that of texture in :func:`match_views`, 0 where the images cannot be compared; ``compared`` is the
-        part of the neighbours that can be.
+    ``neighbours`` are other images with the depth of the surface in them; depths (world units) are 0 without a surface.
+    Returns share, weight and compared, [H, W] float64. The weight is that of texture in :func:`match_views`, 0 where
+    the images cannot be compared; ``compared`` is the part of the neighbours that can be.
     """
     side = 2 * round(SPAN * depth.shape[1]) + 1
     shares, weights, compared = [], [], np.zeros(depth.shape)
@@ -306,21 +225,10 @@ def gather_vertices(
     settings: MatchSettings,
     library: Library,
 ) -> None:
-    """Add the derivatives of the pixels of a view to the vertices of their faces.
+    """Add the derivatives of the pixels of a view to the vertices of their faces (``face`` of :class:`DrawnMesh`).
 
-    A vertex k that moves by s along its normal n_k moves the depth of a pixel of the face with normal m by
-    share_k (m . n_k) / (m . ray) s.
-
-    Parameters
-    ----------
-    surface : Surface
-    camera : Camera
-    face : ndarray [H, W] int32
-        Of :class:`DrawnMesh`.
-    pull : Pull
-    into : Pull
-    settings : MatchSettings
-    library : Library
+    A vertex k that moves by s along its normal n_k moves the depth of a pixel of the face with normal m by share_k (m .
+    n_k) / (m . ray) s.
     """
     local = np.ascontiguousarray(surface.vertices @ camera.rotation.T + camera.T_cam_world[:3, 3])
     normals = np.ascontiguousarray(surface.normals @ camera.rotation.T)

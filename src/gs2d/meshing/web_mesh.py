@@ -15,19 +15,13 @@ JPEG_QUALITY = 88
 
 
 def web_mesh(mesh: Mesh | TexturedMesh, *, max_texture: int | None = None) -> bytes:
-    """Return a mesh as the pages of gs2d read it.
+    """Return a mesh with at least one vertex as the pages of gs2d read it.
 
     The block holds, in this order and without gaps: the length of the header (uint32), the header (JSON, padded with
     spaces to a multiple of 4 bytes), faces [F, 3] uint32, vertices [P, 3] uint16, then colours [P, 3] uint8, or texture
     coordinates [P, 2] uint16 and a JPEG file. The header has the counts ``faces`` and ``vertices``, the bounding box as
-    ``low`` and ``size``, and ``paint``: "color", "texture" or "none".
-
-    Parameters
-    ----------
-    mesh : Mesh or TexturedMesh
-        With at least one vertex.
-    max_texture : int, optional
-        Longest side of the texture, px; larger ones are reduced.
+    ``low`` and ``size``, and ``paint``: "color", "texture" or "none". Textures with a longer side than ``max_texture``
+    (px) are reduced.
     """
     low = mesh.vertices.min(axis=0).astype(np.float64)
     size = np.maximum(mesh.vertices.max(axis=0) - low, 1e-30)

@@ -86,11 +86,7 @@ class PageServer:
     """Serves routes from its own threads until it is closed.
 
     ``port``: None: the first free port from 8080 on. ``routes``: routes by path, without the slash; ``""`` is the page.
-
-    Attributes
-    ----------
-    failure : Exception or None
-        An unexpected error of a route.
+    ``failure`` is an unexpected error of a route.
     """
 
     def __init__(self, port: int | None, routes: Mapping[str, Route], *, option: str = "--port") -> None:

@@ -166,9 +166,10 @@ def check_mesh_options(options: MeshOptions) -> None:
         raise ProtocolError(f"lods must be a whole number >= 1, got {options.lods}")
     if options.collision:
         required()  # before minutes are spent
-    if options.method not in MESH_METHODS:
-        raise ProtocolError(f"--method: {MESH_METHODS.unknown(options.method)}")
-    MESH_METHODS.get(options.method)  # its package can be imported
+    method = _method_name(options)
+    if method not in MESH_METHODS:
+        raise ProtocolError(f"{'--watertight' if options.watertight else '--method'}: {MESH_METHODS.unknown(method)}")
+    MESH_METHODS.get(method)  # its package can be imported
     if options.watertight and options.method not in ("tsdf", "delaunay"):
         raise ProtocolError(f"--watertight uses --method delaunay, got {options.method}; leave one of them out")
     if options.bbox is not None:

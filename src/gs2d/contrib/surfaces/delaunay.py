@@ -15,6 +15,16 @@ from scipy.ndimage import binary_erosion
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from gs2d.contrib.surfaces.minimum_cut import Lines, cast_votes, outside
+from gs2d.contrib.surfaces.oriented_points import (
+    PIXELS_APART,
+    OrientedPoints,
+    merge_pixels,
+    merge_vertices,
+    settle,
+    sight_lines,
+)
+from gs2d.contrib.surfaces.tetrahedra import FACES, Tetrahedra, divide
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
@@ -25,17 +35,7 @@ from gs2d.meshing.extract import Extraction, ExtractOptions, bounds_of, fused_de
 from gs2d.meshing.fusion_bounds import FusionBounds, backproject
 from gs2d.meshing.marching_cubes import inside_box, keep_components, select_faces
 from gs2d.meshing.mesh_methods import register_mesh_method
-from gs2d.meshing.minimum_cut import Lines, cast_votes, outside
-from gs2d.meshing.oriented_points import (
-    PIXELS_APART,
-    OrientedPoints,
-    merge_pixels,
-    merge_vertices,
-    settle,
-    sight_lines,
-)
 from gs2d.meshing.simplify import simplify
-from gs2d.meshing.tetrahedra import FACES, Tetrahedra, divide
 from gs2d.meshing.tsdf_volume import fusion_backend
 from gs2d.render.backends import Backend
 
@@ -61,25 +61,9 @@ def extract_delaunay(
 ) -> Extraction:
     """Extract a mesh from depth maps as the minimum cut of tetrahedra.
 
-    Parameters
-    ----------
-    frames, options
-        As for ``extract``. ``voxel`` is also half the distance of the points; ``max_bytes`` limits their number.
-    threads : int, optional
-    backend : str or Backend
-        Of the fusion.
-
-    Returns
-    -------
-    Extraction
-        ``volume_bytes`` includes the tetrahedra.
-
-    Raises
-    ------
-    ProtocolError
-        If there are fewer than two views or no surface that two of them see, or a limit is invalid.
-    ShapeError, DiskError
-        As for ``extract``.
+    Parameters and errors are those of ``extract``, but ``voxel`` is also half the distance of the points, ``max_bytes``
+    limits their number, and it is a ProtocolError if there are fewer than two views or no surface that two of them see.
+    ``volume_bytes`` of the result includes the tetrahedra.
     """
     backend = fusion_backend(backend)
     spool, samples = spooled(frames, threads)

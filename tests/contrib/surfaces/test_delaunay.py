@@ -8,17 +8,16 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.spatial import Delaunay
 
+from gs2d.contrib.surfaces.delaunay import extract_delaunay
+from gs2d.contrib.surfaces.minimum_cut import UNIT, Lines, cast_votes, minimum_cut_on_cpu
+from gs2d.contrib.surfaces.tetrahedra import CUBE, FACES, Tetrahedra, divide
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
 from gs2d.kernels.library import load
-from gs2d.kernels.native_tetrahedra import minimum_cut_on_cpu
-from gs2d.meshing.delaunay import extract_delaunay
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.evidence import areas
 from gs2d.meshing.extract import ExtractOptions
-from gs2d.meshing.minimum_cut import UNIT, Lines, cast_votes
-from gs2d.meshing.tetrahedra import CUBE, FACES, Tetrahedra, divide
 from surface_shapes import orbit, rays, sphere_depth
 
 BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])
@@ -190,7 +189,7 @@ def test_lines_of_sight_to_the_sky_remove_what_few_views_show_there() -> None:
 
 def test_the_memory_limit_bounds_the_number_of_points(monkeypatch: pytest.MonkeyPatch) -> None:
     fine = extract_delaunay(ball(), ExtractOptions(bbox=BOX))
-    monkeypatch.setattr("gs2d.meshing.delaunay.BYTES_A_POINT", ExtractOptions().max_bytes // 300)
+    monkeypatch.setattr("gs2d.contrib.surfaces.delaunay.BYTES_A_POINT", ExtractOptions().max_bytes // 300)
     coarse = extract_delaunay(ball(), ExtractOptions(bbox=BOX))
     assert len(fine.mesh.vertices) > 1000
     assert 100 < len(coarse.mesh.vertices) <= 300

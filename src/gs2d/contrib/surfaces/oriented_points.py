@@ -33,28 +33,15 @@ SIDES = 60  # bit of a key where the side begins that a vertex faces
 
 @dataclass(frozen=True, eq=False)
 class OrientedPoints:
-    """Points on the surface, thinned to the resolution of the images.
+    """Points on the surface, thinned to the resolution of the images."""
 
-    Attributes
-    ----------
-    xyz : ndarray [P, 3] float64, world units
-    normals : ndarray [P, 3] float32
-        Unit vectors towards the cameras.
-    spacing : ndarray [P] float32, world units
-        Width of the voxel of the point.
-    spread : ndarray [P] float32, world units
-        Standard deviation of the depth maps around the point, along its normal.
-    views : ndarray [P] int32
-        Number of views that see the point.
-    colors : ndarray [P, 3] uint8 or None
-    """
-
-    xyz: np.ndarray
-    normals: np.ndarray
-    spacing: np.ndarray
+    xyz: np.ndarray  # [P, 3] float64, world units
+    normals: np.ndarray  # [P, 3] float32 unit vectors towards the cameras
+    spacing: np.ndarray  # [P] float32: width of the voxel of the point, world units
+    # [P] float32: standard deviation of the depth maps around the point, along its normal, world units
     spread: np.ndarray
-    views: np.ndarray
-    colors: np.ndarray | None
+    views: np.ndarray  # [P] int32: number of views that see the point
+    colors: np.ndarray | None  # [P, 3] uint8
 
     def rows(self, rows: np.ndarray) -> OrientedPoints:
         """Return some of the points."""
@@ -90,13 +77,8 @@ def merge_vertices(mesh: Mesh, cameras: Sequence[Camera], limits: FusionBounds, 
 def merge_pixels(maps: Iterable[DepthMap], limits: FusionBounds, *, apart: float) -> OrientedPoints:
     """Merge the valid pixels of all maps in voxels of 2^k times a base width, by the width of a pixel there.
 
-    Parameters
-    ----------
-    maps : iterable of DepthMap
-    limits : FusionBounds
-        Box and depth limit of the pixels.
-    apart : float, px
-        Width of a voxel. Where a view shows a part of the surface at a finer scale than others, its voxels alone stay.
+    ``limits`` are the box and depth limit of the pixels; ``apart`` is the width of a voxel, px. Where a view shows a
+    part of the surface at a finer scale than others, its voxels alone stay.
     """
     base = apart * limits.pixel_footprint
     merged: list[_Voxels] = []
@@ -273,11 +255,8 @@ def sight_lines(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return at most about ``most`` lines of sight a point, chosen by a fixed rule and weighted by the rest.
 
-    Returns
-    -------
-    points, cameras : ndarray [L] int32
-    weights : ndarray [L] float32
-        Weight of the pixel, times the lines that the chosen one stands for.
+    Returns their points [L] int32, cameras [L] int32 and weights [L] float32: the weight of the pixel, times the lines
+    that the chosen one stands for.
     """
     reach = np.full(len(points.xyz), limits.truncation)
     share = np.minimum(1.0, most / np.maximum(points.views, 1))

@@ -6,37 +6,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.kernels.c_structures import arguments_of
 from gs2d.kernels.library import Library
-from gs2d.kernels.native_tetrahedra import tetrahedra_on_cpu
 
 SIDE = 1 << 20  # steps of the grid along the longest side of the points
 CUBE = 4 * SIDE - 2  # side of the cube around them, in steps; predicates are exact below 2^22
 MARGIN = 3 * SIDE // 2  # from the cube to the points, in steps
 # Corners of the facet opposite to each corner, in an order whose normal (q - p) x (r - p) points to that corner.
 FACES = np.array([[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]])
+ROWS_A_POINT = 9  # tetrahedra; samples of a surface have six to seven
 ROUNDS = 20  # of insertion, each with twice as many points as the one before
 
 
 @dataclass(frozen=True, eq=False)
 class Tetrahedra:
-    """A division of a cube into tetrahedra.
+    """A division of a cube into tetrahedra."""
 
-    Attributes
-    ----------
-    xyz : ndarray [P + 8, 3] float64, world units
-        The points, rounded to 1e-6 of their extent, and the corners of the cube.
-    corners : ndarray [T, 4] int32
-        Positively oriented: det(b - a, c - a, d - a) > 0.
-    neighbours : ndarray [T, 4] int32
-        Tetrahedron opposite to each corner; -1 outside the cube.
-    mirror : ndarray [T, 4] uint8
-        Facet of the neighbour that leads back.
-    """
-
+    # [P + 8, 3] float64, world units: the points, rounded to 1e-6 of their extent, and the corners of the cube
     xyz: np.ndarray
-    corners: np.ndarray
-    neighbours: np.ndarray
-    mirror: np.ndarray
+    corners: np.ndarray  # [T, 4] int32, positively oriented: det(b - a, c - a, d - a) > 0
+    neighbours: np.ndarray  # [T, 4] int32: tetrahedron opposite to each corner; -1 outside the cube
+    mirror: np.ndarray  # [T, 4] uint8: facet of the neighbour that leads back
 
     def first(self) -> np.ndarray:
         """Return one tetrahedron at each point, [P + 8] int32; -1 for duplicates, which have none."""
@@ -82,6 +72,30 @@ def divide(points: np.ndarray, around: np.ndarray, library: Library) -> Tetrahed
     corners, neighbours = corners[order], neighbours[order]
     neighbours = np.where(neighbours >= 0, rank[neighbours], -1).astype(np.int32)
     return Tetrahedra(xyz, corners, neighbours, _mirror(neighbours))
+
+
+def tetrahedra_on_cpu(library: Library, grid: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners and neighbours, [T, 4] int32, of the tetrahedra of grid points [P + 8, 3] int32.
+
+    The last eight points are the corners of a cube around the others, x fastest; ``order`` [P] int32 is that of
+    insertion.
+    """
+    count = ROWS_A_POINT
+    while True:
+        capacity = count * len(grid) + 1000
+        corners, neighbours = np.empty((capacity, 4), np.int32), np.empty((capacity, 4), np.int32)
+        inserted = np.zeros(len(grid), np.uint8)
+        arrays = {"xyz": grid, "order": order, "corners": corners, "neighbours": neighbours, "inserted": inserted}
+        arguments = arguments_of("gs2d_tetrahedra", **arrays, points=len(grid), capacity=capacity)
+        library.call("gs2d_tetrahedra", arguments)
+        if arguments.count >= 0:
+            break
+        count *= 2
+    corners, neighbours = corners[: arguments.count], neighbours[: arguments.count]
+    used = corners[:, 0] >= 0
+    number = np.cumsum(used, dtype=np.int32) - 1
+    neighbours = neighbours[used]
+    return corners[used], np.where(neighbours >= 0, number[neighbours], -1).astype(np.int32)
 
 
 def _order(cells: np.ndarray) -> np.ndarray:

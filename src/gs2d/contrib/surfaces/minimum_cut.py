@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.contrib.surfaces.tetrahedra import FACES, Tetrahedra
+from gs2d.errors import ProtocolError
+from gs2d.kernels.c_structures import arguments_of
 from gs2d.kernels.library import Library
-from gs2d.kernels.native_tetrahedra import minimum_cut_on_cpu, votes_on_cpu
-from gs2d.meshing.tetrahedra import FACES, Tetrahedra
 
 UNIT = 128  # whole-number weight of a line with weight 1
 MOST = 1 << 28  # of a vote or a shape: two arcs with both and their flows fit into 32 bits
@@ -25,36 +26,20 @@ ROWS_AT_ONCE = 1 << 17
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Lines from points to cameras.
+    """Lines from points to cameras."""
 
-    Attributes
-    ----------
-    ends : ndarray [L] int32
-        Points, as rows of ``Tetrahedra.xyz``.
-    starts : ndarray [L, 3] float64, world units
-        Camera centres.
-    sigma : ndarray [L] float64, world units
-        Uncertainty of the points along the lines.
-    weights : ndarray [L] float
-    surfaces : int
-        The first lines end on a surface, the others in free space.
-    """
-
-    ends: np.ndarray
-    starts: np.ndarray
-    sigma: np.ndarray
-    weights: np.ndarray
-    surfaces: int
+    ends: np.ndarray  # [L] int32 points, as rows of ``Tetrahedra.xyz``
+    starts: np.ndarray  # [L, 3] float64 camera centres, world units
+    sigma: np.ndarray  # [L] float64 uncertainty of the points along the lines, world units
+    weights: np.ndarray  # [L]
+    surfaces: int  # the first lines end on a surface, the others in free space
 
 
 def cast_votes(space: Tetrahedra, lines: Lines, library: Library) -> dict[str, np.ndarray]:
     """Return the votes of all lines, in units of 1 / ``UNIT``.
 
-    Returns
-    -------
-    dict of str to ndarray
-        ``facets`` [T, 4] int32: cost of a facet with its tetrahedron outside and the neighbour inside. ``full`` [T]
-        int32: cost of a tetrahedron outside. ``cameras`` [T] uint8: 1 where a line starts.
+    They are ``facets`` [T, 4] int32, the cost of a facet with its tetrahedron outside and the neighbour inside;
+    ``full`` [T] int32, the cost of a tetrahedron outside; and ``cameras`` [T] uint8, 1 where a line starts.
     """
     count = len(space.corners)
     order = np.argsort(lines.ends[: lines.surfaces], kind="stable")  # neighbours walk through the same memory
@@ -75,25 +60,17 @@ def cast_votes(space: Tetrahedra, lines: Lines, library: Library) -> dict[str, n
         "sigma": lines.sigma[order].astype(np.float64),
         "weight": np.rint(UNIT * lines.weights[order]).astype(np.int32),
     }
-    votes_on_cpu(library, arrays | votes, lines.surfaces)
+    library.call("gs2d_votes", lines=len(order), surfaces=lines.surfaces, **arrays, **votes)
     return votes
 
 
 def outside(
     space: Tetrahedra, votes: Mapping[str, np.ndarray], library: Library, *, spacing: np.ndarray, closed: bool = False
 ) -> np.ndarray:
-    """Return which tetrahedra are outside, [T] bool.
+    """Return which tetrahedra are outside, [T] bool, by the votes of ``cast_votes``.
 
-    Parameters
-    ----------
-    space : Tetrahedra
-    votes : mapping of str to ndarray
-        From ``cast_votes``.
-    library : Library
-    spacing : ndarray [P], world units
-        Distance from each point on the surface to the next; the other corners have the median.
-    closed : bool
-        The corners of the cube are outside, so the surface is closed.
+    ``spacing`` [P] is the distance from each point on the surface to the next, world units; the other corners have the
+    median. If ``closed``, the corners of the cube are outside, so the surface is closed.
     """
     cost = QUALITY / 2 * _badness(space) + AREA * _areas(space, spacing)
     shape = np.rint(np.minimum(UNIT * cost, MOST)).astype(np.int32)
@@ -104,6 +81,19 @@ def outside(
     if closed:
         terminal[(space.corners >= len(space.xyz) - 8).any(axis=1)] = MOST
     return minimum_cut_on_cpu(library, space.neighbours, space.mirror, capacity, terminal)[0]
+
+
+def minimum_cut_on_cpu(
+    library: Library, neighbours: np.ndarray, mirror: np.ndarray, capacity: np.ndarray, terminal: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Return the source side [N] bool and the flow; ``capacity`` and ``terminal`` become what is left."""
+    side = np.zeros(len(neighbours), np.uint8)
+    arrays = {"neighbours": neighbours, "mirror": mirror, "capacity": capacity, "terminal": terminal}
+    arguments = arguments_of("gs2d_minimum_cut", **arrays, source_side=side, nodes=len(neighbours))
+    library.call("gs2d_minimum_cut", arguments)
+    if arguments.flow < 0:
+        raise ProtocolError("the minimum cut needs more memory than there is; a lower --memory makes fewer points")
+    return side.astype(bool), int(arguments.flow)
 
 
 def _areas(space: Tetrahedra, spacing: np.ndarray) -> np.ndarray:
