@@ -1,4 +1,4 @@
-"""JSON files with errors that name the file."""
+"""Files with errors that name them: JSON, and bytes."""
 
 from __future__ import annotations
 
@@ -21,15 +21,21 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
         file.write(text + "\n")
 
 
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Read a file, or raise DataError."""
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+
+
 def read_json(path: str | os.PathLike[str]) -> Any:
     """Read a JSON file; a DataError for one that is missing or not JSON names the file and the line."""
-    name = os.fspath(path)
+    name, data = os.fspath(path), read_bytes(path)
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")  # Windows tools write a byte-order mark
+        text = data.decode("utf-8-sig")  # Windows tools write a byte-order mark
     except UnicodeDecodeError as error:
         raise DataError(f"{name} must be JSON in UTF-8, got an invalid byte at offset {error.start}") from error
-    except OSError as error:
-        raise DataError(f"cannot read {name}: {error.strerror or error}") from error
     try:
         return json.loads(text)
     except ValueError as error:

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from gs2d.core.json_files import read_bytes
 from gs2d.errors import DataError
 
 WGS84 = 4326  # EPSG code of latitude and longitude
@@ -82,14 +83,13 @@ def _named_crs(text: str) -> int | None:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
+    if path.is_file() and path.stat().st_size > _LARGEST:
+        raise DataError(f"{path} must be a table of names and numbers, got a file of {path.stat().st_size:,} bytes")
+    data = read_bytes(path)
     try:
-        if path.stat().st_size > _LARGEST:
-            raise DataError(f"{path} must be a table of names and numbers, got a file of {path.stat().st_size:,} bytes")
-        text = path.read_text(encoding="utf-8-sig")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(f"{path} must be UTF-8 text, got an invalid byte at offset {error.start}") from error
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     return [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
 
 

@@ -13,13 +13,13 @@ from gs2d.data.prior_maps import PointsInView
 NEARER = 0.95  # of a point's depth: a nearer surface occludes it; SfM depths have errors of a few percent
 
 
-def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NEARER) -> np.ndarray:
+def hidden_points(depth: np.ndarray, points: PointsInView) -> np.ndarray:
     """Return which points of a view are behind its rendered surface, [M] bool.
 
     ``depth`` [H, W] world units: rendered median depth; 0 without a surface. ``points``: from
-    :meth:`gs2d.data.prior_maps.ObservedPoints.in_view`. ``nearer``: a point is hidden if the surface is nearer than
-    this fraction of its depth.
+    :meth:`gs2d.data.prior_maps.ObservedPoints.in_view`. A point is hidden if the surface is nearer than ``NEARER`` of
+    its depth.
     """
     columns, rows = np.floor(points.pixels).astype(np.int64).T
     surface = np.asarray(depth)[rows, columns]
-    return np.asarray((surface > 0) & (surface < nearer * points.depth))
+    return np.asarray((surface > 0) & (surface < NEARER * points.depth))

@@ -113,7 +113,7 @@ def _expected() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu") -> Lpips:
+def load_lpips(paths: str | Path | Iterable[str | Path]) -> Lpips:
     """Read the weights from files, or from a folder with .pth and .pt files.
 
     Raise DataError if a file is missing or no state dict, or weights are missing or have another shape.
@@ -127,7 +127,7 @@ def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu")
     expected, weights = _expected(), dict[str, Tensor]()
     for file in files:
         try:
-            state = torch.load(file, map_location=device, weights_only=True)
+            state = torch.load(file, map_location="cpu", weights_only=True)
         except MemoryError:
             raise
         except Exception as error:  # torch's readers raise many kinds

@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.atomic_files import atomic_write
+from gs2d.core.json_files import read_bytes
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.core.text import first_line
 from gs2d.errors import DataError
@@ -153,10 +154,7 @@ def _read_foreign(path: Path) -> Mesh:
     """Read a mesh with trimesh, keeping the order of the vertices."""
     import trimesh  # slow to import (0.6 s)
 
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror}") from error
+    data = read_bytes(path)
     kind = path.suffix.lower().lstrip(".")
     if kind == "obj":  # trimesh reads a comment behind a face as one of its corners
         data = re.sub(rb"#[^\n]*", b"", data)

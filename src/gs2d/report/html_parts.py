@@ -77,12 +77,9 @@ def missing(text: str) -> Markup:
     return macro("macros.html", "missing", text)
 
 
-def image_tag(image: np.ndarray, caption: str = "", *, alt: str, width: int = 360, full: str | None = None) -> Markup:
-    """Return an image [H, W, 3 or 4] inline as JPEG, at most ``width`` px wide, over white.
-
-    ``full``: path of the full-size image relative to the report; shown when the image is enlarged.
-    """
-    return macro("macros.html", "figure", image, caption, alt, width, full)
+def image_tag(image: np.ndarray, *, alt: str, width: int) -> Markup:
+    """Return an image [H, W, 3 or 4] inline as JPEG, at most ``width`` px wide, over white."""
+    return macro("macros.html", "figure", image, "", alt, width)
 
 
 def drawing(svg: str, title: str) -> Markup:

@@ -88,17 +88,16 @@ def write_page(
     splats: Splats,
     scene: PageScene,
     *,
-    sh_degree: int = 3,
     meshes: Mapping[str, bytes] | None = None,
     photographs: Sequence[bytes] = (),
 ) -> dict[str, Any]:
     """Write the page with its data as one file; return ``splats`` stored, ``sh_degree``, and ``bytes`` of the file.
 
-    ``sh_degree``: highest SH degree to store; degrees 3, 2, 1, 0 take 45, 24, 9 or 0 bytes per splat. ``meshes``:
-    ``meshing.web_mesh`` blocks, by the names of :class:`PageOffer`. ``photographs``: JPEG files, one per view.
+    ``meshes``: ``meshing.web_mesh`` blocks, by the names of :class:`PageOffer`. ``photographs``: JPEG files, one per
+    view.
     """
     meshes = meshes or {}
-    packed = pack_for(scene, splats, sh_degree)
+    packed = pack_for(scene, splats)
     offer = PageOffer(tuple(meshes), bool(photographs), served=False)
     before, after = _page(scene, packed.facts, offer)
     written = 0
@@ -114,11 +113,11 @@ def write_page(
     return {"splats": packed.count, "sh_degree": packed.degree, "bytes": written}
 
 
-def pack_for(scene: PageScene, splats: Splats, sh_degree: int = 3) -> PackedSplats:
-    """Return splats as the page of a scene reads them, with SH up to a degree."""
+def pack_for(scene: PageScene, splats: Splats) -> PackedSplats:
+    """Return splats as the page of a scene reads them; SH of degree 3, 2, 1, 0 take 45, 24, 9 or 0 bytes per splat."""
     settings = scene.settings
     eyes = np.array([view.camera.center for view in scene.views])
-    return pack_splats(splats, scene.focus, min(sh_degree, settings.sh_degree), settings.alpha_min, eyes)
+    return pack_splats(splats, scene.focus, settings.sh_degree, settings.alpha_min, eyes)
 
 
 def served_page(scene: PageScene, offer: PageOffer) -> bytes:

@@ -34,6 +34,7 @@ from gs2d.contrib.capture.camera_files import (
     register_file_reader,
     whole,
 )
+from gs2d.core.json_files import read_bytes
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
@@ -109,14 +110,12 @@ register_file_reader("metashape", FileReader("cameras.xml (Metashape)", camera_f
 def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:
     """Return the chunk with most cameras, and a note if there are several."""
     try:
-        text = path.read_bytes()
+        text = read_bytes(path)
         if any(word in text.replace(b"\0", b"") for word in (b"<!DOCTYPE", b"<!ENTITY")):  # in UTF-16 too
             raise DataError(f"{path} must be XML of Metashape, got XML with document type definitions")
         document = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DataError(f"{path} must be XML, got: {error}; is the file complete?") from error
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     chunks = [chunk for chunk in document.iter("chunk") if chunk.find("cameras") is not None]
     if not chunks:
         raise DataError(f"{path} must hold a chunk with cameras, got none; export the cameras again (Agisoft XML)")

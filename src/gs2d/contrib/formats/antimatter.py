@@ -7,13 +7,12 @@ A record consists of position (3 float32), scales (3 float32, not logarithms), c
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import numpy as np
 
 from gs2d.core.atomic_files import atomic_write
+from gs2d.core.json_files import read_bytes
 from gs2d.core.sh import C0
-from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, log_scales_of, logit_of_byte, sigmoid, to_byte, unit_quats
@@ -39,10 +38,7 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 def read_splat(path: str | os.PathLike[str]) -> Gaussians:
     """Read a ``.splat`` file. It has no header, so a DataError reports an incomplete record or invalid values."""
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    data = read_bytes(path)
     if len(data) % _RECORD.itemsize:
         raise DataError(
             f"{os.fspath(path)}: expected a .splat file with {_RECORD.itemsize} bytes per splat, got {len(data)} in "
@@ -62,9 +58,7 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
     )
 
 
-@register_format("splat", ending=".splat")
-def _write(path: Path, splats: Splats) -> None:
-    write_splat(path, Gaussians.of(splats))
+register_format("splat", ending=".splat")(lambda path, splats: write_splat(path, Gaussians.of(splats)))
 
 
 @register_splat_reader("splat", endings=(".splat",))

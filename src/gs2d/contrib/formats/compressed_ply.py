@@ -11,12 +11,10 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from pathlib import Path
 
 import numpy as np
 
 from gs2d.core.sh import C0
-from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
@@ -226,9 +224,8 @@ def _sh(path: object, element: PlyElement | None, n: int) -> np.ndarray:
     return ((fraction - 0.5) * 8.0).astype(np.float32).reshape(n, 3, count // 3).transpose(0, 2, 1)
 
 
-@register_format("compressed", ending=".compressed.ply")
-def _write(path: Path, splats: Splats) -> tuple[str, ...]:
-    return write_compressed_ply(path, Gaussians.of(splats))
+_register = register_format("compressed", ending=".compressed.ply")
+_register(lambda path, splats: write_compressed_ply(path, Gaussians.of(splats)))
 
 
 @register_splat_reader("compressed", ply_kind="compressed")

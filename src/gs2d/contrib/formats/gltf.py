@@ -21,7 +21,6 @@ from gs2d.contrib.formats.gltf_document import GltfDocument, node_matrices, read
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
-from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, log_scales_of, logit, sigmoid, to_byte, unit_quats
@@ -228,9 +227,7 @@ def _placed(path: str | os.PathLike[str], g: Gaussians, matrix: np.ndarray) -> G
         raise DataError(f"{Path(path)}: {error} of the nodes of splats; bake it into them") from error
 
 
-@register_format("gltf", ending=".glb")
-def _write(path: Path, splats: Splats) -> None:
-    write_gltf(path, Gaussians.of(splats))
+register_format("gltf", ending=".glb")(lambda path, splats: write_gltf(path, Gaussians.of(splats)))
 
 
 register_splat_reader("gltf", endings=(".glb", ".gltf"), mesh=gltf_mesh)(read_gltf)

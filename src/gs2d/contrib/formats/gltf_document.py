@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.core.json_files import read_bytes
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError
 
@@ -119,7 +120,7 @@ class GltfDocument:
         home = Path(os.path.realpath(self.path)).parent
         if "\0" in uri or not Path(os.path.realpath(name)).is_relative_to(home):
             raise DataError(f"{self.path}: expected buffers in the folder of the file, got {uri[:80]!r}")
-        return _bytes(name)
+        return read_bytes(name)
 
 
 def _whole(number: Any) -> int:
@@ -128,16 +129,9 @@ def _whole(number: Any) -> int:
     return number
 
 
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
-
-
 def read_document(path: str | os.PathLike[str]) -> GltfDocument:
     """Read a .glb or .gltf file without its external files; raises DataError if it is missing or no glTF 2.0."""
-    data, inside = _bytes(Path(path)), None
+    data, inside = read_bytes(path), None
     text = data
     if data[:4] == b"glTF":
         text, inside = _chunks(path, data)

@@ -27,7 +27,6 @@ from gs2d.contrib.formats.compressed_ply import morton_order
 from gs2d.contrib.formats.sog_palette import codebook, nearest_code, palette
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_entries, check_growth
-from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
@@ -359,9 +358,7 @@ def _places(tree: Any, wanted: int) -> list[tuple[int, int, int]]:
     return [(file, offset, count) for (file, offset), count in sorted(found.items())]
 
 
-@register_format("sog", ending=".sog")
-def _write(path: Path, splats: Splats) -> None:
-    write_sog(path, Gaussians.of(splats))
+register_format("sog", ending=".sog")(lambda path, splats: write_sog(path, Gaussians.of(splats)))
 
 
 register_splat_reader("sog", endings=(".sog", "/meta.json", "/lod-meta.json"))(read_sog)

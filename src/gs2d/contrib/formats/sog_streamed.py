@@ -24,7 +24,6 @@ from gs2d.contrib.formats.levels import halved
 from gs2d.contrib.formats.sog import packed_sog
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.camera import look_at
-from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.io.formats.splat_formats import register_format
 from gs2d.io.gaussians import Gaussians, unit_quats
@@ -255,6 +254,5 @@ def _remove(folder: Path) -> None:
         folder.rmdir()
 
 
-@register_format("streamed", ending=f"/{INDEX}", size=streamed_bytes)
-def _write(path: Path, splats: Splats) -> None:
-    write_streamed_sog(path, Gaussians.of(splats))
+_register = register_format("streamed", ending=f"/{INDEX}", size=streamed_bytes)
+_register(lambda path, splats: write_streamed_sog(path, Gaussians.of(splats)))

@@ -18,7 +18,6 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ import numpy as np
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import required
 from gs2d.core.growth import check_growth
-from gs2d.core.splats import Splats
+from gs2d.core.json_files import read_bytes
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import (
@@ -164,10 +163,7 @@ def read_spz(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[
     message if SH bands above degree 3 are dropped. Raises DataError if the file is missing, of another kind or version,
     or truncated, and BackendError for version 4 without zstandard.
     """
-    try:
-        packed = Path(path).read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    packed = read_bytes(path)
     version, bits, system, parts = (_parts_of_4 if packed[:4] == b"NGSP" else _parts_of_3)(path, packed)
     return _in_our_axes(_gaussians(path, version, bits, parts, tell), system), version
 
@@ -326,14 +322,8 @@ def _completed(q: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     return q[:, [3, 0, 1, 2]].astype(np.float32)
 
 
-@register_format("spz", ending=".spz")
-def _write(path: Path, splats: Splats) -> tuple[str, ...]:
-    return write_spz(path, Gaussians.of(splats))
-
-
-@register_format("spz4", ending=".spz")
-def _write_4(path: Path, splats: Splats) -> tuple[str, ...]:
-    return write_spz(path, Gaussians.of(splats), version=4)
+register_format("spz", ending=".spz")(lambda path, splats: write_spz(path, Gaussians.of(splats)))
+register_format("spz4", ending=".spz")(lambda path, splats: write_spz(path, Gaussians.of(splats), version=4))
 
 
 @register_splat_reader("spz", endings=(".spz",))

@@ -24,7 +24,6 @@ import numpy as np
 from gs2d.contrib.formats import usd_process
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.extras import install
-from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import (
@@ -259,9 +258,7 @@ def _placed(where: str, g: Gaussians, matrix: np.ndarray) -> Gaussians:
         raise DataError(f"{where}: {error}; bake the transform into the splats") from error
 
 
-@register_format("usd", ending=".usd")
-def _write(path: Path, splats: Splats) -> None:
-    write_usd(path, Gaussians.of(splats))
+register_format("usd", ending=".usd")(lambda path, splats: write_usd(path, Gaussians.of(splats)))
 
 
 register_splat_reader("usd", endings=ENDINGS)(read_usd)

@@ -34,7 +34,7 @@ from gs2d.contrib.lab.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
 from gs2d.contrib.lab.surface_score import ScoredClouds
 from gs2d.core.checks import check_shapes
 from gs2d.core.image_arrays import natural_key
-from gs2d.core.json_files import read_json
+from gs2d.core.json_files import read_bytes, read_json
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import apply, similarity_scale
 from gs2d.errors import DataError
@@ -153,10 +153,8 @@ def read_trajectory(path: Path) -> np.ndarray:
 
 def _number_rows(path: Path) -> list[list[float]]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_bytes(path).decode().splitlines()
         return [[float(word) for word in line.split()] for line in lines if line.strip()]
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     except ValueError as error:
         raise DataError(f"{path} must hold numbers only, got: {error}; copy it again") from error
 

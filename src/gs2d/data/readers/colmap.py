@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from gs2d.core.image_arrays import is_number, natural_key
+from gs2d.core.json_files import read_bytes
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama
@@ -221,10 +222,7 @@ def _points_bin(path: Path) -> ColmapPoints:
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Return (line number, text) without comments; empty lines stay (an image without 2-D points has one)."""
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")  # file names
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    text = read_bytes(path).decode("utf-8-sig", "surrogateescape")  # file names
     return [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1) if not line.lstrip().startswith("#")]
 
 
