@@ -11,7 +11,6 @@ from typing import Annotated, Any
 from gs2d.config.arguments import Arg
 from gs2d.config.registry import Register, Registry
 from gs2d.pipeline.prepare.options import (
-    EditOptions,
     EvaluateOptions,
     MeshOptions,
     PosesOptions,
@@ -45,7 +44,7 @@ class Command:
         getattr(importlib.import_module(module), function)(options, console)
 
 
-_CORE = "doctor reconstruct view poses train mesh info render export edit evaluate recipes"
+_CORE = "doctor reconstruct view poses train mesh info render export evaluate recipes"
 COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE.split(), __name__))
 
 
@@ -187,17 +186,6 @@ class ExportCommand(Common):
     """Format: html (a page that works offline in any browser), 2dgs (of the 2DGS paper), 3dgs (opens in common
     viewers), compressed, spz, spz4, splat, usd, gltf, sog, streamed, or one of a package (default: by the ending of
     --out; .ply is 3dgs)."""
-
-
-@_core("edit", LOOK)
-@dataclass(frozen=True, kw_only=True)
-class EditCommand(EditOptions, Common):
-    """Delete, merge or move splats of a run, undoably, or of a file."""
-
-    run: RunPath
-    """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
-    out: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Write the edited splats to this file, in the format of its ending, and leave the run as it is."""
 
 
 @_core("recipes", MEASURE)

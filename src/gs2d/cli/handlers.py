@@ -17,7 +17,7 @@ from gs2d.core.extras import FFMPEG, install
 from gs2d.core.processes import process_rank
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
-from gs2d.pipeline.prepare.options import EditOptions, MeshOptions, TextureOptions, values
+from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 
 WIDTH = 60  # columns of the verdict: half of a small screen
 _NAMES, _GRADES = 14, 8  # columns of the names and grades of findings
@@ -224,17 +224,6 @@ def export(command: c.ExportCommand, console: Console) -> None:
     console.say(
         f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, format {result['layout']}"
     )
-    for note in result["notes"]:
-        console.say(note)
-    console.result(result)
-
-
-def edit(command: c.EditCommand, console: Console) -> None:
-    """``gs2d edit``."""
-    from gs2d.pipeline.finish.splat_files import edit as edit_splats
-
-    result = edit_splats(command.run, EditOptions(**values(EditOptions, command)), command.out)
-    console.say(f"{result['file']}: {result['splats']:,} splats, before {result['before']:,}")
     for note in result["notes"]:
         console.say(note)
     console.result(result)

@@ -25,7 +25,6 @@ LensModel = Literal[
 ]
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
 BoxOption = Annotated[Box | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
-Transform = tuple[float, float, float, float, float, float, float]
 Overrides = Annotated[tuple[str, ...], Arg(name="set", metavar="STAGE.FIELD=VALUE", repeated=True)]
 ViewerOption = Annotated[int | None, Arg(metavar="[PORT]", bare="0")]  # 0: the first free port
 Photos = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
@@ -285,22 +284,6 @@ class RenderOptions(Options):
     """Image width; the height follows (default: as in training)."""
     video: Annotated[Path | None, Arg(metavar="FILE")] = None
     """With --orbit: also write a video with 30 frames a second, .mp4 (H.264, needs ffmpeg) or .webp."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EditOptions(Options):
-    """The edit of splats; one of the options, or ``merge`` with ``transform``."""
-
-    keep_box: BoxOption = None
-    """Delete the splats whose centre is outside this box. `gs2d view` shows its numbers."""
-    delete_box: BoxOption = None
-    """Delete the splats whose centre is in this box."""
-    merge: Annotated[Path | None, Arg(metavar="OTHER")] = None
-    """Add the splats of another run or file, in the same coordinates, or moved there by --transform."""
-    transform: Annotated[Transform | None, Arg(metavar="SCALE RX RY RZ X Y Z")] = None
-    """Scale, rotate about x, then y, then z (degrees), then move. Needs --out; with --merge, moves OTHER."""
-    undo: bool = False
-    """Restore the splats of the run before the last edit; may be repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,17 +15,27 @@ from scipy.spatial.transform import Rotation
 from ball_runs import options
 from gs2d import Splats, rasterize, read_splats, write_splats
 from gs2d.cli import run as gs2d
+from gs2d.contrib.edit import edit_splats as module
+from gs2d.contrib.edit.edit_command import EditOptions
+from gs2d.contrib.edit.edit_splats import edit
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.finish import splat_files as module
-from gs2d.pipeline.finish.splat_files import edit
-from gs2d.pipeline.prepare.options import EditOptions
 from gs2d.pipeline.train.train_run import train
 from splat_scenes import a_scene
-from tiny import ball_cameras
+from tiny import ball_cameras, write_capture
 
 BOX = (-0.5, -2.0, -2.0, 0.6, 2.0, 2.0)
 TURN = (2.0, 20.0, -35.0, 110.0, 0.5, -1.0, 3.0)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_capture(tmp_path_factory.mktemp("data") / "ball")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return train(options(capture, tmp_path_factory.mktemp("runs") / "undisturbed"))
 
 
 @pytest.fixture
