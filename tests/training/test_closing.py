@@ -1,7 +1,8 @@
-"""Depth that is interpolated where photographs have no texture, and the points that start there."""
+"""Points that start where photographs have no texture, and points that are moved onto the planes around them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,74 +11,81 @@ import pytest
 from gs2d.config.robust import DenseStart
 from gs2d.data.scene import Scene, View
 from gs2d.training.start import plane_sweep
-from gs2d.training.start.closing import closed_depth, enclosed
-from gs2d.training.start.plane_sweep import sweep_views
-from gs2d.training.start.start_points import start_points
+from gs2d.training.start.plane_sweep import Sweep, sweep_views, unproject
+from gs2d.training.start.start_points import Found, levelled, start_points
 from wall_scene import WALL, image, wall
 
-SHAPE = (14, 18)
-ROWS, COLUMNS = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]].astype(np.float64)
-PLANE = 1 / (0.2 + 0.003 * ROWS + 0.005 * COLUMNS)  # the depth of a plane: 1/z is affine in the pixel
-GREY, ALL = np.full((*SHAPE, 3), 0.5), np.ones(SHAPE, bool)
+SETTINGS = DenseStart(side=48, min_angle=1.0, cell=1.5)
+Places = Callable[[np.ndarray], np.ndarray]
 
 
-def rim() -> np.ndarray:
-    known = np.ones(SHAPE, bool)
-    known[1:-1, 1:-1] = False
-    return known
-
-
-def test_a_plane_is_restored_from_its_rim() -> None:
-    closed = closed_depth(np.where(rim(), PLANE, 0), rim(), GREY, ALL)
-    np.testing.assert_allclose(closed, PLANE, rtol=1e-5)
-
-
-def test_depth_does_not_cross_an_edge_of_the_photograph() -> None:
-    color, behind = GREY.copy(), COLUMNS >= 9
-    color[behind] = 0.8
-    truth = np.where(behind, 3 * PLANE, PLANE)
-    closed = closed_depth(np.where(rim(), truth, 0), rim(), color, ALL)
-    np.testing.assert_allclose(closed, truth, rtol=0.1)  # the other surface is three times as far
-
-
-@pytest.mark.filterwarnings("error")
-def test_what_is_connected_to_nothing_known_has_no_depth() -> None:
-    assert (closed_depth(np.zeros(SHAPE), np.zeros(SHAPE, bool), GREY, ALL) == 0).all()
-    usable = ALL.copy()
-    usable[3:8, 3] = usable[3:8, 7] = usable[3, 3:8] = usable[7, 3:8] = False  # a ring of masked pixels
-    closed = closed_depth(np.where(rim(), PLANE, 0), rim(), GREY, usable)
-    assert (closed[4:7, 4:7] == 0).all()
-    assert (closed[1:-1, 9:-1] > 0).all()
-
-
-def test_only_pixels_between_known_ones_are_enclosed() -> None:
-    known = np.zeros((5, 5), bool)
-    known[0, 2] = known[4, 2] = known[2, 0] = known[2, 4] = True
-    expected = np.zeros((5, 5), bool)
-    expected[2, 2] = True
-    np.testing.assert_array_equal(enclosed(known), expected)
-
-
-def bare(places: np.ndarray) -> np.ndarray:
+def patch(places: np.ndarray) -> np.ndarray:
     return np.asarray((np.abs(places[..., 0] - 0.2) < 1.1) & (np.abs(places[..., 1]) < 0.9))
 
 
-def patched() -> Scene:
-    """Return the wall with a bare rectangle, without sparse points to start from."""
+def scene_with(bare: Places) -> Scene:
+    """Return the wall, bare in some places, without sparse points to start from."""
     views = (View.from_arrays(v.name, v.camera, image(v.camera, bare=bare)) for v in wall().train)
     return replace(wall(), train=tuple(views), points=None)
 
 
-def in_patch(points: np.ndarray) -> np.ndarray:
-    return np.asarray(points[(np.abs(points[:, 0] - 0.2) < 0.6) & (np.abs(points[:, 1]) < 0.4)])
+def with_depth_in_patch(sweep: Sweep, depth: float) -> Sweep:
+    """Return the sweep with another depth in the patch."""
+    depths = []
+    for view, found in zip(sweep.views, sweep.depths, strict=True):
+        inside = patch(unproject(view, np.full(found.shape, WALL)))
+        depths.append(np.where(inside, depth, np.where(found > 0, WALL, 0)))
+    return replace(sweep, depths=depths)
+
+
+def started_in_patch(scene: Scene, sweep: Sweep) -> np.ndarray:
+    points = start_points(scene, sweep, SETTINGS).points
+    inner = (np.abs(points[:, 0] - 0.2) < 0.6) & (np.abs(points[:, 1]) < 0.4)
+    return np.asarray(points[inner & (np.abs(points[:, 2] - WALL) < 0.3 * WALL)])
 
 
 def test_points_start_on_a_bare_part_of_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plane_sweep, "WIDE_WINDOWS", plane_sweep.FINE_WINDOWS)  # those would reach the texture
-    scene, settings = patched(), DenseStart(side=48, min_angle=1.0, cell=2.0)
-    sweep = sweep_views(scene, settings)
-    found = in_patch(start_points(scene, sweep, settings).points)
-    assert len(found) >= 4
+    scene = scene_with(patch)
+    sweep = sweep_views(scene, SETTINGS)
+    found = started_in_patch(scene, sweep)
+    assert len(found) >= 3
     np.testing.assert_allclose(found[:, 2], WALL, rtol=0.03)
-    monkeypatch.setattr("gs2d.training.start.start_points.closed_depth", lambda depth, *_: np.zeros_like(depth))
-    assert len(in_patch(start_points(scene, sweep, settings).points)) < len(found) / 3
+    monkeypatch.setattr("gs2d.training.start.start_points.library_for", lambda _: None)
+    assert len(started_in_patch(scene, sweep)) < len(found) / 3
+
+
+def test_a_wide_gap_with_texture_stays_open() -> None:
+    scene = scene_with(lambda places: np.zeros(places.shape[:-1], bool))
+    assert len(started_in_patch(scene, with_depth_in_patch(sweep_views(scene, SETTINGS), 0))) == 0
+
+
+def test_a_gap_that_views_see_through_stays_open() -> None:
+    scene = scene_with(patch)
+    sweep = sweep_views(scene, SETTINGS)
+    assert len(started_in_patch(scene, with_depth_in_patch(sweep, 0))) >= 4
+    assert len(started_in_patch(scene, with_depth_in_patch(sweep, 2 * WALL))) == 0
+
+
+def found_at(places: np.ndarray) -> Found:
+    count, random = len(places), np.random.default_rng(1)
+    normals = random.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Found(places, np.full((count, 3), 0.5), normals, np.full(count, 0.01), np.zeros(count))
+
+
+def test_points_move_onto_the_plane_around_them() -> None:
+    random = np.random.default_rng(0)
+    flat = np.stack([*random.uniform(-1, 1, (2, 4000)), random.normal(0, 0.01, 4000)], axis=1)
+    flat[:40, 2] += 0.08  # outliers do not tilt it
+    moved = levelled(found_at(flat), 3.0)
+    inner = (np.abs(moved.places[:, :2]) < 0.9).all(axis=1) & (np.abs(moved.places[:, 2]) < 0.05)
+    assert moved.places[inner, 2].std() < 0.004
+    assert np.median(np.abs(moved.normals[inner, 2])) > 0.98
+
+
+def test_points_of_a_wire_stay() -> None:
+    random = np.random.default_rng(0)
+    wire = np.stack([np.linspace(0, 3, 300), *random.normal(0, 0.004, (2, 300))], axis=1)
+    moved = levelled(found_at(wire), 3.0)
+    assert (moved.places == wire).all(axis=1).mean() > 0.9

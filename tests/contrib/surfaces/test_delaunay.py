@@ -9,8 +9,6 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.spatial import Delaunay
 
 from gs2d.contrib.surfaces.delaunay import extract_delaunay
-from gs2d.contrib.surfaces.minimum_cut import UNIT, Lines, cast_votes, minimum_cut_on_cpu
-from gs2d.contrib.surfaces.tetrahedra import CUBE, FACES, Tetrahedra, divide
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
@@ -18,6 +16,8 @@ from gs2d.kernels.library import load
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.evidence import areas
 from gs2d.meshing.extract import ExtractOptions
+from gs2d.meshing.minimum_cut import UNIT, Lines, cast_votes, minimum_cut_on_cpu
+from gs2d.meshing.tetrahedra import CUBE, FACES, Tetrahedra, divide
 from surface_shapes import orbit, rays, sphere_depth
 
 BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])

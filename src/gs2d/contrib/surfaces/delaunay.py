@@ -15,7 +15,6 @@ from scipy.ndimage import binary_erosion
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gs2d.contrib.surfaces.minimum_cut import Lines, cast_votes, outside
 from gs2d.contrib.surfaces.oriented_points import (
     PIXELS_APART,
     OrientedPoints,
@@ -24,7 +23,6 @@ from gs2d.contrib.surfaces.oriented_points import (
     settle,
     sight_lines,
 )
-from gs2d.contrib.surfaces.tetrahedra import FACES, Tetrahedra, divide
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
@@ -35,7 +33,9 @@ from gs2d.meshing.extract import Extraction, ExtractOptions, bounds_of, fused_de
 from gs2d.meshing.fusion_bounds import FusionBounds, backproject
 from gs2d.meshing.marching_cubes import inside_box, keep_components, select_faces
 from gs2d.meshing.mesh_methods import register_mesh_method
+from gs2d.meshing.minimum_cut import Lines, cast_votes, outside
 from gs2d.meshing.simplify import simplify
+from gs2d.meshing.tetrahedra import FACES, Tetrahedra, divide
 from gs2d.meshing.tsdf_volume import fusion_backend
 from gs2d.render.backends import Backend
 

@@ -1,4 +1,4 @@
-// Minimum cut of a graph whose nodes have at most four neighbours (called by contrib/surfaces/minimum_cut.py).
+// Minimum cut of a graph whose nodes have at most four neighbours (called by meshing/minimum_cut.py).
 //
 // The algorithm of Boykov and Kolmogorov (2004): a tree grows from either terminal, each path where they meet is
 // saturated, and nodes that lose their parent look for another one in their tree. Whole numbers and a fixed order make

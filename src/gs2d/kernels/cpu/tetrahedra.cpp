@@ -1,4 +1,4 @@
-// Delaunay tetrahedra of points on an integer grid (reference: scipy.spatial.Delaunay, contrib/surfaces/tetrahedra.py).
+// Delaunay tetrahedra of points on an integer grid (reference: scipy.spatial.Delaunay, meshing/tetrahedra.py).
 //
 // Incremental insertion (Bowyer 1981, Watson 1981): find the tetrahedron of a point by a walk, remove all tetrahedra
 // whose circumsphere contains the point, and connect the faces of the cavity with it. Coordinates are integers below

@@ -1,4 +1,4 @@
-// Votes of lines of sight for tetrahedra inside and outside a surface (called by contrib/surfaces/minimum_cut.py).
+// Votes of lines of sight for tetrahedra inside and outside a surface (called by meshing/minimum_cut.py).
 //
 // Lines are independent and add whole numbers, so the result does not depend on the number of threads.
 #include <atomic>

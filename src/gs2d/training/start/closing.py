@@ -1,78 +1,120 @@
-"""Close depth maps where photographs have no texture, as far as several views agree.
+"""Points where a plane sweep found none: a minimum cut closes the gaps between swept points.
 
-A plane sweep finds no depth on bare walls and table tops. Between known pixels, the inverse depth of a plane is an
-affine function of the pixel, which interpolation by a Laplace equation restores exactly; edges of the photograph, where
-surfaces end, hardly conduct. The result is only a guess, so a point is used where the closed depth maps of neighbouring
-views agree on it and no view sees through it. Formulas: docs/math.md, "Dense start".
+On bare walls, ceilings and table tops, photographs do not match. Lines of sight to the swept points tell which
+tetrahedra between the points are free, and the cut closes the rest with little area: a rim becomes a ceiling. The
+result is a guess, so a point is used where no view sees through it and, in wide gaps, where views show it without
+texture. Formulas: docs/math.md, "Dense start".
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import spsolve
 
-EDGE = 0.02  # colour difference of neighbouring pixels, [0, 1], at which conduction falls to 1 / e; noise is below
-LEAK = 1e-3  # conduction across the strongest edge: each pixel that is connected to a known one gets a value
+from gs2d.kernels.library import Library
+from gs2d.losses.formulas import flatness
+from gs2d.meshing.minimum_cut import Lines, cast_votes, outside
+from gs2d.meshing.tetrahedra import FACES, divide
+from gs2d.training.start.plane_sweep import AGREE, BARE, VOTES, Sweep, project
+
+UNSURE = 2.0  # px: standard deviation of swept depths along their lines of sight, as a width at that depth
+# Spacings: facets with an edge longer than the first cross a gap, those with one longer than the last are no surface.
+GAP, NARROW, LONGEST = 2.0, 10.0, 60.0
+LINES = 8  # of sight, at most, to a point; more of them take memory and change little
+THROUGH = 0.03  # a view sees through a point if its depth is larger by this fraction
+FACING = 0.1  # smallest cosine between a facet's normal and the direction to a camera that sees it
 
 
-def closed_depth(depth: np.ndarray, known: np.ndarray, color: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Interpolate the unknown depths of a view.
+def gap_points(
+    sweep: Sweep, places: np.ndarray, pixel: np.ndarray, cell: float, library: Library
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return points in the gaps between swept points: places [M, 3], colours [M, 3], normals [M, 3], pixel sizes [M].
 
-    Parameters
-    ----------
-    depth : ndarray [H, W] world units
-        Along the optical axis.
-    known : ndarray [H, W] bool
-        Pixels that keep their depth.
-    color : ndarray [H, W, 3] in [0, 1]
-    usable : ndarray [H, W] bool
-        False for masked pixels, which conduct nothing.
-
-    Returns
-    -------
-    ndarray [H, W] world units
-        0 where no known pixel is connected.
+    ``places`` [P, 3] and ``pixel`` [P], the size of a pixel there, are of the swept points, which are ``cell`` pixels
+    apart.
     """
-    links, fixed = _links(color, usable), known.ravel()
-    laplace = csr_array(diags_array(np.asarray(links.sum(axis=1)).ravel()) - links)
-    part = connected_components(links, directed=False)[1]
-    free = np.isin(part, part[fixed]) & ~fixed
-    closed = np.where(fixed, depth.ravel(), 0.0)
-    if free.any():
-        rows = laplace[free]
-        closed[free] = 1 / spsolve(rows[:, free].tocsc(), -(rows[:, fixed] @ (1 / closed[fixed])))
-    return np.asarray(closed.reshape(depth.shape))
+    known = {
+        index: np.where(sweep.known(index), sweep.depths[index], 0)
+        for index in range(len(sweep.views))
+        if sweep.neighbours[index]
+    }
+    centers = np.stack([-view.T[:3, :3].T @ view.T[:3, 3] for view in sweep.views])
+    spacing = cell * pixel
+    faces = _facets(sweep, known, centers, places, pixel, spacing, library)
+    corners = places[faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) / spacing[faces].max(axis=1)
+    crossing = (edges > GAP) & (edges <= LONGEST)
+    found, which = _spread(corners[crossing], spacing[faces[crossing]].max(axis=1))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[crossing]
+    normals = (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))[which]
+    kept, colors = _believed(sweep, known, centers, found, normals, (edges[crossing] <= NARROW)[which])
+    return found[kept], colors[kept], normals[kept], pixel[faces[crossing]].mean(axis=1)[which][kept]
 
 
-def _links(color: np.ndarray, usable: np.ndarray) -> csr_array:
-    """Return the conduction between neighbouring pixels, sparse and symmetric [HW, HW]."""
-    count = usable.size
-    index = np.arange(count).reshape(usable.shape)
-    first, second, values = [], [], []
-    for axis in (0, 1):
-        change = np.abs(np.diff(color, axis=axis)).max(axis=2)
-        a, b = (np.moveaxis(index, axis, 0)[part] for part in (slice(0, -1), slice(1, None)))
-        both = usable.ravel()[a] & usable.ravel()[b]
-        first.append(a.ravel())
-        second.append(b.ravel())
-        values.append((both * np.moveaxis(np.exp(-((change / EDGE) ** 2)) + LEAK, axis, 0)).ravel())
-    i, j, v = map(np.concatenate, (first, second, values))
-    i, j, v = i[v > 0], j[v > 0], v[v > 0]
-    both_ways = np.concatenate([i, j]), np.concatenate([j, i])
-    return csr_array(coo_array((np.concatenate([v, v]), both_ways), shape=(count, count)))
+def _facets(
+    sweep: Sweep,
+    known: Mapping[int, np.ndarray],
+    centers: np.ndarray,
+    places: np.ndarray,
+    pixel: np.ndarray,
+    spacing: np.ndarray,
+    library: Library,
+) -> np.ndarray:
+    """Return the facets of the minimum cut, rows of ``places`` [F, 3], counter-clockwise seen from free space."""
+    ends, cameras, count = [], [], np.zeros(len(places), np.int64)
+    for index in np.random.default_rng(0).permutation(list(known)):
+        z, column, row, inside = project(sweep.views[index], places)
+        seen = inside & (np.abs(known[index][row, column] - z) <= AGREE * z) & (count < LINES)
+        count += seen
+        ends.append(np.flatnonzero(seen))
+        cameras.append(np.full(len(ends[-1]), index))
+    end = np.concatenate(ends)
+    space = divide(places, centers, library)
+    lines = Lines(
+        end.astype(np.int32), centers[np.concatenate(cameras)], UNSURE * pixel[end], np.ones(len(end)), len(end)
+    )
+    out = outside(space, cast_votes(space, lines, library), library, spacing=spacing)
+    inner, facet = np.nonzero(~out[:, None] & (space.neighbours >= 0) & out[space.neighbours])
+    faces = np.take_along_axis(space.corners[inner], FACES[facet], 1)[:, [0, 2, 1]]
+    return np.asarray(faces[(faces < len(places)).all(axis=1)])
 
 
-def enclosed(known: np.ndarray) -> np.ndarray:
-    """Return the unknown pixels with known ones to the left, to the right, above and below, [H, W] bool.
+def _spread(corners: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return random points on triangles [F, 3, 3], about one in each square of the spacing [F], and their triangles."""
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    which = np.repeat(np.arange(len(corners)), np.ceil(area / spacing**2).astype(np.int64))
+    u, v = np.random.default_rng(0).random((2, len(which), 1))
+    root = np.sqrt(u)  # Turk 1990: uniform over the triangle
+    a, b, c = (corners[which, k] for k in range(3))
+    return (1 - root) * a + root * (1 - v) * b + root * v * c, which
 
-    Others are extrapolated; the sky above a roof is one of them.
+
+def _believed(
+    sweep: Sweep,
+    known: Mapping[int, np.ndarray],
+    centers: np.ndarray,
+    places: np.ndarray,
+    normals: np.ndarray,
+    narrow: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which points most views see in bare pixels while none sees through them, and their mean colours there.
+
+    A view sees a point that faces it if its own depth there is unknown or the same. In ``narrow`` gaps [M], pixels may
+    have texture.
     """
-
-    def before(image: np.ndarray, axis: int) -> np.ndarray:
-        return np.asarray(np.logical_or.accumulate(image, axis=axis))
-
-    ahead = before(known, 0) & before(known, 1)
-    behind = before(known[::-1], 0)[::-1] & before(known[:, ::-1], 1)[:, ::-1]
-    return np.asarray(ahead & behind & ~known)
+    bare, other, through = (np.zeros(len(places), np.int64) for _ in range(3))
+    colors = np.zeros((len(places), 3))
+    for index, depth in known.items():
+        view = sweep.views[index]
+        z, column, row, inside = project(view, places)
+        there, color = depth[row, column], view.color.permute(1, 2, 0)
+        ray = centers[index] - places
+        facing = (ray * normals).sum(axis=1) > FACING * np.linalg.norm(ray, axis=1)
+        seen = inside & facing & ((there == 0) | (np.abs(there - z) <= THROUGH * z))
+        flat = seen & view.usable[row, column] & (narrow | (flatness(color).numpy() > BARE)[row, column])
+        bare += flat
+        other += seen & ~flat
+        through += inside & (there > (1 + THROUGH) * z)
+        colors += flat[:, None] * color.numpy()[row, column]
+    return (bare >= np.maximum(VOTES, other)) & (through == 0), colors / np.maximum(bare, 1)[:, None]

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from gs2d.config.robust import MAX_ANGLE, DenseStart
-from gs2d.core.memory_limit import cache_bytes
-from gs2d.core.spill import Spilled
 from gs2d.core.transforms import nearest_distances
 from gs2d.data.scene import PointCloud, Scene
 from gs2d.errors import DataError
-from gs2d.losses.formulas import flatness
-from gs2d.training.start.closing import closed_depth, enclosed
-from gs2d.training.start.plane_sweep import BARE, SWEEP_BYTES, SmallView, Sweep, project, unproject
+from gs2d.kernels.library import library_for
+from gs2d.training.start.closing import gap_points
+from gs2d.training.start.plane_sweep import Sweep, unproject
 
 WAITING = 500_000  # points that are collected before they are thinned
-MARGIN = 5.0  # px between them and known ones: small gaps close by themselves, and dark recesses are often narrow
-CLOSED_AGREE = 0.015  # interpolated depths of two views agree when they differ by at most this fraction
-CLOSED_CELL = 2.0  # cells of swept points: interpolated ones are sparser, since they have no detail
+LEAST_SWEPT = 8  # points, below which gaps are not closed
+GAP_CELL = 2.0  # cells of swept points: those in gaps are sparser, since they have no detail
+NEIGHBOURS, REACH, TURNS = 48, 3.3, 3  # of a point, and the distance in cells of the farthest, that its plane fits
+LEAST_ON_PLANE = 8  # neighbours
+FLAT, WIDE = 0.2, 0.1  # ratios of variances: across a plane at most, along it at least; a wire is not wide
+ROWS_AT_ONCE = 1 << 14
 REPEATED = 3.0  # cells: nearer to a swept point, a sparse point starts no splat of its own
 
 
@@ -53,7 +53,8 @@ def start_points(
             "--set dense_start=null"
         )
     swept = _thinned((_swept(sweep, index) for index in range(len(sweep.views))), settings.cell)
-    between = _between(sweep, swept, settings.cell, 0 if scene.ahead else cache_bytes(SWEEP_BYTES))
+    swept = levelled(swept, settings.cell)
+    between = _between(sweep, swept, settings.cell)
     parts: list[tuple[np.ndarray, ...]] = [
         (found.places, found.colors, found.normals, np.zeros(len(found.places))) for found in (swept, between)
     ]
@@ -78,25 +79,27 @@ def _has_points(scene: Scene) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class Found:
+    """Points that start splats."""
+
     places: np.ndarray  # [M, 3] world units
     colors: np.ndarray  # [M, 3] in [0, 1]
     normals: np.ndarray  # [M, 3]
     pixel: np.ndarray  # [M] world units: the size of a pixel there
     score: np.ndarray  # [M]
 
-    def rows(self, which: np.ndarray) -> _Found:
+    def rows(self, which: np.ndarray) -> Found:
         """Return some of the points."""
-        return _Found(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+        return Found(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
-def _joined(found: Sequence[_Found]) -> _Found:
-    return _Found(*(np.concatenate([getattr(f, name) for f in found]) for name in _Found.__dataclass_fields__))
+def _joined(found: Sequence[Found]) -> Found:
+    return Found(*(np.concatenate([getattr(f, name) for f in found]) for name in Found.__dataclass_fields__))
 
 
-def _thinned(found: Iterable[_Found], cell: float) -> _Found:
+def _thinned(found: Iterable[Found], cell: float) -> Found:
     """Thin the points of all views together, without having all of them in memory."""
-    waiting: list[_Found] = []
+    waiting: list[Found] = []
     for some in found:
         waiting.append(some)
         if sum(len(one.score) for one in waiting) > max(WAITING, 2 * len(waiting[0].score)):
@@ -104,7 +107,7 @@ def _thinned(found: Iterable[_Found], cell: float) -> _Found:
     return _thin(_joined(waiting), cell)
 
 
-def _thin(found: _Found, cell: float) -> _Found:
+def _thin(found: Found, cell: float) -> Found:
     """Keep the point with the best score in each cell of ``cell`` pixels; cell sizes are powers of two."""
     level = np.rint(np.log2(found.pixel * cell))
     keys = np.concatenate([np.floor(found.places / np.exp2(level)[:, None]), level[:, None]], axis=1)
@@ -126,56 +129,58 @@ def _unique_rows(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return keys[first], first
 
 
-def _swept(sweep: Sweep, index: int) -> _Found:
+def _swept(sweep: Sweep, index: int) -> Found:
     """Return the points of a view on which enough neighbours agree."""
-    return _found(sweep.views[index], sweep.depths[index], sweep.known(index), sweep.scores[index])
-
-
-def _found(view: SmallView, depth: np.ndarray, kept: np.ndarray, score: np.ndarray) -> _Found:
-    """Return the points of the pixels of a view that are ``kept`` [H, W]."""
+    view, depth, kept = sweep.views[index], sweep.depths[index], sweep.known(index)
     places = unproject(view, depth)
     normals = np.cross(np.gradient(places, axis=1), np.gradient(places, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    colors = view.color.permute(1, 2, 0).numpy()
-    return _Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], score[kept])
+    colors, score = view.color.permute(1, 2, 0).numpy(), sweep.scores[index]
+    return Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], score[kept])
 
 
-def _between(sweep: Sweep, swept: _Found, cell: float, limit_bytes: int) -> _Found:
-    """Return interpolated points where no swept ones are: neighbours agree on them, and none sees through them.
+def _between(sweep: Sweep, swept: Found, cell: float) -> Found:
+    """Return points in the gaps between swept ones; none without the native library, which cuts tetrahedra."""
+    library = library_for(sweep.views[0].grey)
+    if library is None or len(swept.places) < LEAST_SWEPT:
+        return swept.rows(np.zeros(0, np.int64))
+    places, colors, normals, pixel = gap_points(sweep, swept.places, swept.pixel, cell, library)
+    found = Found(places, colors, normals, pixel, np.zeros(len(places)))
+    return _thin(found.rows(cKDTree(swept.places).query(places)[0] > cell * pixel), GAP_CELL * cell)
 
-    Closed depth maps beyond ``limit_bytes`` are on the disk.
+
+def levelled(found: Found, cell: float) -> Found:
+    """Move points onto the planes that their neighbours lie on, and give them the normals of these planes.
+
+    Weights fall with the distance from the point and, in three turns, with that from the plane. Points whose neighbours
+    do not lie on a plane stay.
     """
-
-    def closed(index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the closed depth map, negative where it is interpolated, and the pixels that may start a splat."""
-        view, depth, known = sweep.views[index], sweep.depths[index], sweep.known(index)
-        color = view.color.permute(1, 2, 0)
-        wanted = enclosed(known) & view.usable & (flatness(color).numpy() > BARE)
-        wanted &= distance_transform_edt(~known) >= MARGIN
-        filled = closed_depth(depth, known, color.numpy(), view.usable) if wanted.any() else np.zeros_like(depth)
-        return np.where(known, depth, -filled).astype(np.float32), wanted
-
-    count, tree = len(sweep.views), cKDTree(swept.places)
-    depths = Spilled(map(closed, range(count)), limit_bytes)
-
-    def agreed(index: int) -> _Found:
-        view, (signed, wanted) = sweep.views[index], depths[index]
-        depth, kept = np.abs(signed).astype(np.float64), wanted & (signed < 0)
-        places = unproject(view, depth)[kept]
-        votes, seen_through = np.zeros(len(places), np.int64), np.zeros(len(places), bool)
-        for other in sweep.neighbours[index]:
-            z, column, row, inside = project(sweep.views[other], places)
-            there = depths[other][0][row, column]
-            votes += inside & (np.abs(np.abs(there) - z) <= CLOSED_AGREE * z)
-            seen_through |= inside & (there > (1 + 2 * CLOSED_AGREE) * z)
-        kept[kept] = (votes >= sweep.quorum(index)) & ~seen_through
-        found = _found(view, depth, kept, np.zeros_like(depth))
-        return found.rows(tree.query(found.places)[0] > cell * found.pixel)
-
-    return _thinned(map(agreed, range(count)), CLOSED_CELL * cell)
+    places, normals = found.places.copy(), found.normals.copy()
+    if len(places) < NEIGHBOURS:
+        return found
+    tree = cKDTree(found.places)
+    for rows in np.array_split(np.arange(len(places)), len(places) // ROWS_AT_ONCE + 1):
+        distance, near = tree.query(found.places[rows], k=NEIGHBOURS)
+        reach = REACH * cell * found.pixel[rows, None]
+        weight = np.maximum(1 - (distance / reach) ** 2, 0) ** 2
+        for _ in range(TURNS):
+            total = np.maximum(weight.sum(axis=1), 1e-12)
+            middle = np.einsum("nk,nka->na", weight, found.places[near]) / total[:, None]
+            arms = found.places[near] - middle[:, None]
+            spread, axes = np.linalg.eigh(np.einsum("nk,nka,nkb->nab", weight, arms, arms) / total[:, None, None])
+            normal = axes[:, :, 0]
+            off = np.einsum("nka,na->nk", arms, normal) / (3 * np.sqrt(np.maximum(spread[:, :1], 1e-30)))
+            weight = weight * np.maximum(1 - off**2, 0) ** 2
+        flat = (spread[:, 0] < FLAT * spread[:, 1]) & (spread[:, 1] > WIDE * spread[:, 2])
+        flat &= (weight > 0).sum(axis=1) >= LEAST_ON_PLANE
+        rows, normal = rows[flat], normal[flat]
+        height = np.einsum("na,na->n", found.places[rows] - middle[flat], normal)
+        places[rows] -= height[:, None] * normal
+        normals[rows] = normal
+    return replace(found, places=places, normals=normals)
 
 
-def _apart(points: PointCloud, swept: _Found, cell: float) -> tuple[np.ndarray, ...]:
+def _apart(points: PointCloud, swept: Found, cell: float) -> tuple[np.ndarray, ...]:
     """Return sparse points far from the swept ones: positions, colours in [0, 1], zero normals, sizes."""
     finite = np.logical_and.reduce(np.isfinite(points.points), axis=1)
     places = np.asarray(points.points, dtype=np.float64)[finite]

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.contrib.surfaces.tetrahedra import FACES, Tetrahedra
 from gs2d.errors import ProtocolError
 from gs2d.kernels.c_structures import arguments_of
 from gs2d.kernels.library import Library
+from gs2d.meshing.tetrahedra import FACES, Tetrahedra
 
 UNIT = 128  # whole-number weight of a line with weight 1
 MOST = 1 << 28  # of a vote or a shape: two arcs with both and their flows fit into 32 bits
