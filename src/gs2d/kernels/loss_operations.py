@@ -5,16 +5,24 @@ The formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
+
+Vjp: TypeAlias = Callable[..., Sequence[Tensor | None]]
+"""Gradients of the first tensors of a loss, from its tensors, which of them need one, and the cotangents.
+
+Of several cotangents, some may be None, which is 0.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +41,9 @@ class LossOperations:
     """The fused losses of a processor, differentiable, with values that do not depend on the number of threads.
 
     All of them raise ShapeError if shapes differ, or if a tensor has another dtype or device than the processor needs.
-    ``functions`` are the torch.autograd.Functions of photometric losses, normal consistency, normal smoothness and
-    masked mean; their arguments are contiguous and checked, and the last one is the engine, a library or launcher.
+    A subclass implements the methods with an underscore, which get checked, contiguous tensors and return the values of
+    a loss and its :data:`Vjp`, which is only called if gradients are ``wanted``.
     """
-
-    functions: ClassVar[tuple[Any, Any, Any, Any]]
-
-    def __init__(self, engine: Any) -> None:
-        self._engine = engine
 
     @property
     def blur(self) -> Callable[[Tensor], Tensor] | None:
@@ -49,6 +52,24 @@ class LossOperations:
 
     def _ready(self, **tensors: Tensor | None) -> list[Any]:
         """Return the tensors, detached and contiguous; ShapeError for another dtype or device."""
+        raise NotImplementedError
+
+    def _photometric(
+        self, *images: Tensor | None, expected: tuple[float, float, float], wanted: bool
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Vjp]:
+        """``images``: rendered, target, mask and target_mean."""
+        raise NotImplementedError
+
+    def _normal_consistency(
+        self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, wanted: bool
+    ) -> tuple[Tensor, Vjp]:
+        raise NotImplementedError
+
+    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Vjp]:
+        """``images``: normal, alpha, flatness and mask."""
+        raise NotImplementedError
+
+    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Vjp]:
         raise NotImplementedError
 
     def photometric(
@@ -71,8 +92,8 @@ class LossOperations:
         shapes |= {} if target_mean is None else {"target_mean": (target_mean, "H W 3")}
         check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
         _, target, target_mean = self._ready(rendered=rendered, target=target, target_mean=target_mean)
-        given = (target, _mask_of(mask, rendered), target_mean, expected, needs_gradient(rendered))
-        l1, ssim, l2 = self.functions[0].apply(rendered.contiguous(), *given, self._engine)
+        loss = partial(self._photometric, expected=expected, wanted=needs_gradient(rendered))
+        l1, ssim, l2 = _Fused.apply(loss, rendered.contiguous(), target, _mask_of(mask, rendered), target_mean)
         return l1, ssim, l2
 
     def normal_consistency(
@@ -91,9 +112,9 @@ class LossOperations:
             raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
         *_, weights = self._ready(normal=normal, depth=depth, alpha=alpha, weights=how.weights)
         how = replace(how, mask=_mask_of(how.mask, normal), weights=weights)
-        images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
         wanted = needs_gradient(normal, depth, alpha)
-        value: Tensor = self.functions[1].apply(*images, how, expected, wanted, self._engine)
+        loss = partial(self._normal_consistency, how=how, expected=expected, wanted=wanted)
+        value: Tensor = _Fused.apply(loss, normal.contiguous(), depth.contiguous(), alpha.contiguous())
         return value
 
     def normal_smoothness(
@@ -108,8 +129,8 @@ class LossOperations:
         if flatness.dtype != torch.uint8 or flatness.device != normal.device:
             raise ShapeError(f"flatness must be uint8 on {normal.device}, got {flatness.dtype} on {flatness.device}")
         _, alpha = self._ready(normal=normal, alpha=alpha)
-        given = (alpha, flatness.contiguous(), _mask_of(mask, normal), expected, needs_gradient(normal))
-        value: Tensor = self.functions[2].apply(normal.contiguous(), *given, self._engine)
+        loss = partial(self._normal_smoothness, expected=expected, wanted=needs_gradient(normal))
+        value: Tensor = _Fused.apply(loss, normal.contiguous(), alpha, flatness.contiguous(), _mask_of(mask, normal))
         return value
 
     def masked_mean(self, values: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -119,8 +140,26 @@ class LossOperations:
         """
         check_shapes({"values": (values, "H W")} | ({} if mask is None else {"mask": (mask, "H W")}))
         self._ready(values=values)
-        mean: Tensor = self.functions[3].apply(values.contiguous(), _mask_of(mask, values), self._engine)
+        mean: Tensor = _Fused.apply(self._masked_mean, values.contiguous(), _mask_of(mask, values))
         return mean
+
+
+class _Fused(torch.autograd.Function):
+    """The values of a loss of some tensors; ``loss`` returns them and its :data:`Vjp`."""
+
+    @staticmethod
+    def forward(ctx: Any, loss: Callable[..., tuple[Any, Vjp]], *tensors: Tensor | None) -> Any:
+        values, ctx.vjp = loss(*tensors)
+        ctx.save_for_backward(*tensors)  # notices if a caller changes one in place
+        ctx.set_materialize_grads(isinstance(values, Tensor))
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        gradients = ctx.vjp(tensors, ctx.needs_input_grad[1:], *cotangents)
+        return None, *gradients, *[None] * (len(tensors) - len(gradients))
 
 
 def needs_gradient(*tensors: Tensor) -> bool:

@@ -6,17 +6,16 @@ computed in the backward pass, with cotangents read on the device; expected ones
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.kernel_arguments import THREADS, arguments_of
-from gs2d.kernels.loss_operations import LossOperations, NormalOptions
+from gs2d.kernels.loss_operations import LossOperations, NormalOptions, Vjp
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
@@ -48,155 +47,101 @@ def strips(height: int, width: int) -> int:
     return -(-3 * width // STRIP) * -(-height // STRIP_ROWS)
 
 
-def _launch(launcher: Launcher, kernel: str, blocks: int, *named: Mapping[str, Any], **fields: Any) -> None:
-    launcher.launch(kernel, blocks, THREADS, arguments_of(kernel, *named, **fields))
-
-
-def _finish(launcher: Launcher, partials: Tensor, *, complement: bool = False) -> Tensor:
-    """Return [1 / count, mean, ...] from the blocks' [count, sum, ...], one row each."""
-    means = partials.new_empty(len(partials))
-    counts = {"blocks": partials.shape[1], "values": len(partials) - 1, "complement": int(complement)}
-    _launch(launcher, "finish_means", 1, counts, partials=partials, means=means)
-    return means
-
-
-class _CudaPhotometric(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        rendered: Tensor,
-        target: Tensor,
-        mask: Tensor | None,
-        target_mean: Tensor | None,
-        expected: tuple[float, float, float],
-        wanted: bool,
-        launcher: Launcher,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        height, width = rendered.shape[:2]
-        blocks = strips(height, width)
-        partials = rendered.new_empty(4, blocks)
-        maps = rendered.new_empty(3, height, width, 3) if wanted else None
-        given = {"rendered": rendered, "target": target, "mask": mask, "maps": maps, "partials": partials}
-        _launch(launcher, "photometric_forward", blocks, given, height=height, width=width)
-        means = _finish(launcher, partials)
-        ctx.launcher = launcher
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(rendered, target, mask, maps, means)
-        return means[1].clone(), means[2].clone(), means[3].clone()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *given: Tensor | None) -> tuple[Tensor | None, ...]:
-        rendered, target, mask, maps, means = ctx.saved_tensors
-        gradient = torch.empty_like(rendered)
-        height, width = rendered.shape[:2]
-        tensors = {"rendered": rendered, "target": target, "mask": mask, "maps": maps, "means": means}
-        tensors |= dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, given), strict=True)) | {"gradient": gradient}
-        _launch(ctx.launcher, "photometric_vjp", strips(height, width), tensors, height=height, width=width)
-        return gradient, *[None] * 6
-
-
-def _normal_inputs(how: NormalOptions, normal: Tensor, depth: Tensor, alpha: Tensor) -> dict[str, Any]:
-    """Return the arguments that both passes of normal consistency take."""
-    inputs: dict[str, Any] = {"normal": normal, "depth": depth, "alpha": alpha}
-    inputs |= {"mask": how.mask, "weights": how.weights}
+def _normal_inputs(how: NormalOptions) -> dict[str, Any]:
+    """Return the options that both passes of normal consistency take."""
+    inputs: dict[str, Any] = {"mask": how.mask, "weights": how.weights}
     inputs |= {name: getattr(how.camera, name) for name in ("height", "width", "fx", "fy", "cx", "cy")}
     inputs |= {"per_splat": int(how.per_splat), "at_camera": int(how.at_camera)}
     return inputs | {"rotation": tuple(np.asarray(how.camera.rotation).ravel().tolist())}
 
 
-class _CudaNormalConsistency(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        normal: Tensor,
-        depth: Tensor,
-        alpha: Tensor,
-        how: NormalOptions,
-        expected: float,
-        wanted: bool,
-        launcher: Launcher,
-    ) -> Tensor:
-        blocks = -(-depth.numel() // MEAN_PIXELS)
+class CudaLosses(LossOperations):
+    """The losses of CUDA kernels; the launcher is that of the tensors' device."""
+
+    def __init__(self, launcher: Launcher) -> None:
+        self._launcher = launcher
+
+    def _ready(self, **tensors: Tensor | None) -> list[Any]:
+        return ready(**tensors)
+
+    def _launch(self, kernel: str, blocks: int, *named: Mapping[str, Any], **fields: Any) -> None:
+        self._launcher.launch(kernel, blocks, THREADS, arguments_of(kernel, *named, **fields))
+
+    def _finish(self, partials: Tensor, *, complement: bool = False) -> Tensor:
+        """Return [1 / count, mean, ...] from the blocks' [count, sum, ...], one row each."""
+        means = partials.new_empty(len(partials))
+        counts = {"blocks": partials.shape[1], "values": len(partials) - 1, "complement": int(complement)}
+        self._launch("finish_means", 1, counts, partials=partials, means=means)
+        return means
+
+    def _photometric(
+        self, *images: Tensor | None, expected: tuple[float, float, float], wanted: bool
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Vjp]:
+        rendered: Any = images[0]
+        height, width = rendered.shape[:2]
+        blocks = strips(height, width)
+        partials = rendered.new_empty(4, blocks)
+        given = {"maps": rendered.new_empty(3, height, width, 3) if wanted else None, "height": height, "width": width}
+        compared = ("rendered", "target", "mask")
+        self._launch("photometric_forward", blocks, given, dict(zip(compared, images, strict=False)), partials=partials)
+        means = self._finish(partials)
+
+        def vjp(images: Sequence[Any], needed: Sequence[bool], *cotangents: Tensor | None) -> Sequence[Tensor]:
+            gradient = torch.empty_like(images[0])
+            found = dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, cotangents), strict=True))
+            found |= dict(zip(compared, images, strict=False)) | {"means": means, "gradient": gradient}
+            self._launch("photometric_vjp", blocks, given, found)
+            return (gradient,)
+
+        return (means[1].clone(), means[2].clone(), means[3].clone()), vjp
+
+    def _normal_consistency(
+        self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, wanted: bool
+    ) -> tuple[Tensor, Vjp]:
+        blocks, given = -(-depth.numel() // MEAN_PIXELS), _normal_inputs(how)
         partials = depth.new_empty(2, blocks)
-        inputs = _normal_inputs(how, normal, depth, alpha)
-        _launch(launcher, "normal_consistency", blocks, inputs, partials=partials)
-        means = _finish(launcher, partials, complement=not how.per_splat and how.weights is None)
-        ctx.launcher, ctx.how = launcher, how
-        ctx.save_for_backward(normal, depth, alpha, means)
-        return means[1].clone()
+        self._launch("normal_consistency", blocks, given, normal=normal, depth=depth, alpha=alpha, partials=partials)
+        means = self._finish(partials, complement=not how.per_splat and how.weights is None)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        *images, means = ctx.saved_tensors
-        want = [*ctx.needs_input_grad[:2], ctx.needs_input_grad[2] and ctx.how.per_splat]
-        gradients = [torch.empty_like(x) if w else None for x, w in zip(images, want, strict=True)]
-        blocks = -(-ctx.how.camera.width // NORMAL_W) * -(-ctx.how.camera.height // NORMAL_H)
-        outputs = dict(zip(("g_normal", "g_depth", "g_alpha"), gradients, strict=True))
-        outputs |= {"means": means, "cotangent": _cotangent(cotangent)}
-        _launch(ctx.launcher, "normal_consistency_vjp", blocks, _normal_inputs(ctx.how, *images), outputs)
-        return (*gradients, *[None] * 4)
+        def vjp(images: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor | None]:
+            want = [*needed[:2], needed[2] and how.per_splat]
+            gradients = [torch.empty_like(x) if w else None for x, w in zip(images, want, strict=True)]
+            tiles = -(-how.camera.width // NORMAL_W) * -(-how.camera.height // NORMAL_H)
+            inputs = dict(zip(("normal", "depth", "alpha"), images, strict=True))
+            outputs = dict(zip(("g_normal", "g_depth", "g_alpha"), gradients, strict=True))
+            outputs |= {"means": means, "cotangent": _cotangent(cotangent)}
+            self._launch("normal_consistency_vjp", tiles, given, inputs, outputs)
+            return gradients
 
+        return means[1].clone(), vjp
 
-class _CudaNormalSmoothness(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        normal: Tensor,
-        alpha: Tensor,
-        flatness: Tensor,
-        mask: Tensor | None,
-        expected: float,
-        wanted: bool,
-        launcher: Launcher,
-    ) -> Tensor:
-        (height, width), blocks = alpha.shape, -(-alpha.numel() // MEAN_PIXELS)
-        inputs = {"normal": normal, "alpha": alpha, "flatness": flatness, "mask": mask}
-        partials = normal.new_empty(2, blocks)
-        _launch(launcher, "normal_smoothness", blocks, inputs, partials=partials, height=height, width=width)
-        ctx.launcher = launcher
-        means = _finish(launcher, partials)
-        ctx.save_for_backward(*inputs.values(), means)
-        return means[1].clone()
+    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Vjp]:
+        normal: Any = images[0]
+        height, width = normal.shape[:2]
+        blocks, size = -(-height * width // MEAN_PIXELS), {"height": height, "width": width}
+        partials, names = normal.new_empty(2, blocks), ("normal", "alpha", "flatness", "mask")
+        self._launch("normal_smoothness", blocks, size, dict(zip(names, images, strict=True)), partials=partials)
+        means = self._finish(partials)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        normal, alpha, flatness, mask, means = ctx.saved_tensors
-        gradient, (height, width) = torch.empty_like(normal), alpha.shape
-        inputs = {"normal": normal, "alpha": alpha, "flatness": flatness, "mask": mask, "means": means}
-        inputs |= {"cotangent": _cotangent(cotangent), "g_normal": gradient}
-        blocks = -(-alpha.numel() // MEAN_PIXELS)
-        _launch(ctx.launcher, "normal_smoothness", blocks, inputs, height=height, width=width)
-        return gradient, *[None] * 6
+        def vjp(images: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor]:
+            gradient = torch.empty_like(images[0])
+            found = {"means": means, "cotangent": _cotangent(cotangent), "g_normal": gradient}
+            self._launch("normal_smoothness", blocks, size, dict(zip(names, images, strict=True)), found)
+            return (gradient,)
 
+        return means[1].clone(), vjp
 
-class _CudaMaskedMean(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, mask: Tensor | None, launcher: Launcher) -> Tensor:
+    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Vjp]:
         blocks = -(-values.numel() // MEAN_PIXELS)
         partials = values.new_empty(2, blocks)
         height, width = values.shape
         given = {"values": values, "mask": mask, "partials": partials}
-        _launch(launcher, "masked_mean", blocks, given, height=height, width=width)
-        means = _finish(launcher, partials)
-        ctx.shape = values.shape
-        ctx.save_for_backward(mask, means)
-        return means[1].clone()
+        self._launch("masked_mean", blocks, given, height=height, width=width)
+        means = self._finish(partials)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        mask, means = ctx.saved_tensors
-        each = cotangent * means[0]
-        return (each.expand(ctx.shape) if mask is None else mask * each), None, None
+        def vjp(tensors: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor]:
+            values, mask = tensors
+            each = cotangent * means[0]
+            return (each.expand_as(values) if mask is None else mask * each,)
 
-
-class CudaLosses(LossOperations):
-    """The losses of CUDA kernels; the engine is the launcher of the tensors' device."""
-
-    functions = (_CudaPhotometric, _CudaNormalConsistency, _CudaNormalSmoothness, _CudaMaskedMean)
-
-    def _ready(self, **tensors: Tensor | None) -> list[Any]:
-        return ready(**tensors)
+        return means[1].clone(), vjp
