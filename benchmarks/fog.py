@@ -26,8 +26,7 @@ import numpy as np
 import torch
 
 from gs2d.config.protocols import GENERIC, Protocol
-from gs2d.config.recipe import Recipe
-from gs2d.config.robust import Removal
+from gs2d.config.recipe import Recipe, Removal
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene

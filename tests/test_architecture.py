@@ -89,7 +89,7 @@ INSIDE = {
     "training": {
         "trainer": 6,
         "cached_objective whole_steps": 5,
-        "first_splats objective resumable": 4,
+        "objective resumable": 4,
         "actions densify robust": 3,
         "learned optimizer parallel rows": 2,
         "state": 1,

@@ -14,8 +14,8 @@ from typing import Any
 import gs2d
 from gs2d.cli.command_line import NAMES, options_of
 from gs2d.config.presets import get_recipe
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES
+from gs2d.config.recipe import DepthPrior, NormalPrior
 from gs2d.config.serialize import apply_overrides
 
 PACKAGE = Path(gs2d.__file__).parent

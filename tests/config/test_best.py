@@ -16,8 +16,7 @@ from gs2d.config.presets import (
     with_few_views,
     with_robustness,
 )
-from gs2d.config.recipe import GradDensify
-from gs2d.config.robust import DenseStart, Removal
+from gs2d.config.recipe import DenseStart, GradDensify, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import from_json, to_json
 

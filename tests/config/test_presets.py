@@ -15,8 +15,7 @@ from gs2d.config.presets import (
     with_depth_prior,
     with_normal_prior,
 )
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
-from gs2d.config.recipe import ALL, GradDensify, Stage, validate
+from gs2d.config.recipe import ALL, DepthPrior, GradDensify, NormalPrior, Stage, validate
 from gs2d.errors import RecipeError
 
 

@@ -8,13 +8,14 @@ import pytest
 
 from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
 from gs2d.config.densify import Densify
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.quantities import EXPOSURE, POSES
 from gs2d.config.recipe import (
     ALPHA,
+    DepthPrior,
     GradDensify,
     LearningRates,
     LossTerm,
+    NormalPrior,
     Recipe,
     Stage,
     validate,

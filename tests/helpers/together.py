@@ -23,8 +23,7 @@ from torch import Tensor
 from gs2d.config.presets import two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.quantities import EXPOSURE, POSES
-from gs2d.config.recipe import LossTerm, Recipe
-from gs2d.config.robust import DenseStart, Removal
+from gs2d.config.recipe import DenseStart, LossTerm, Recipe, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.errors import Gs2dError
 from gs2d.training import events

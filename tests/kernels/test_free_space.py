@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart
 from gs2d.core.splats import Splats
 from gs2d.training.robust import free_space_maps as free_space
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart
 from gs2d.kernels.library import Library, available_variants, library_for
 from gs2d.training.start import plane_sweep
 from gs2d.training.start.plane_sweep import SmallView, Windows, best_planes, best_planes_reference, sweep_views

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from gs2d.config.loss_registry import LOSSES
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
-from gs2d.config.recipe import LossTerm, Recipe, Stage
+from gs2d.config.recipe import DepthPrior, LossTerm, NormalPrior, Recipe, Stage
 from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.kernels.native_losses import NativeLosses

@@ -14,8 +14,7 @@ from gs2d.config.presets import (
     with_robustness,
 )
 from gs2d.config.protocols import DTU, GENERIC, Protocol
-from gs2d.config.recipe import LearningRates, Recipe
-from gs2d.config.robust import Removal
+from gs2d.config.recipe import LearningRates, Recipe, Removal
 from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
 from gs2d.data.prior_maps import ObservedPoints

@@ -18,7 +18,7 @@ from benchmarks.wide_captures import (
 from PIL import Image
 
 from gs2d.cli import run
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart
 from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.core.similarity import apply, umeyama

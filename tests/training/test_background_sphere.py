@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart
 from gs2d.data.scene import View
 from gs2d.training.start.background_sphere import sphere_points
 from gs2d.training.start.plane_sweep import sweep_views

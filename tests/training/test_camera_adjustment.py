@@ -10,7 +10,7 @@ import torch
 
 from gs2d.config.presets import two_dgs
 from gs2d.config.protocols import GENERIC
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import look_at
 from gs2d.core.transforms import common_motion, perturb_pose, se3_exp, similarity_motions

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart
 from gs2d.data.scene import Scene, View
 from gs2d.training.start import plane_sweep
 from gs2d.training.start.plane_sweep import Sweep, sweep_views, unproject

@@ -11,8 +11,7 @@ import torch
 
 from gs2d.config.presets import two_dgs
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Recipe
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart, Recipe
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.sh import sh_to_rgb

@@ -8,8 +8,7 @@ import torch
 
 from gs2d.config.presets import two_dgs_r
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Recipe
-from gs2d.config.robust import FEW_VIEWS, Removal
+from gs2d.config.recipe import FEW_VIEWS, Recipe, Removal
 from gs2d.render.api import rasterize
 from gs2d.training.robust.regularise import dropout_rate, dropped_out, kept_splats
 from gs2d.training.trainer import Trainer

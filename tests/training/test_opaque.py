@@ -10,8 +10,7 @@ import torch
 
 from gs2d.config.presets import two_dgs_r
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import LossTerm, Recipe
-from gs2d.config.robust import Removal
+from gs2d.config.recipe import LossTerm, Recipe, Removal
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.data.scene import View
 from gs2d.render.backends import get_backend

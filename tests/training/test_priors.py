@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from gs2d.config.presets import with_depth_prior, with_normal_prior
-from gs2d.config.prior_settings import DepthPrior
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import LearningRates, Recipe
+from gs2d.config.recipe import DepthPrior, LearningRates, Recipe
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.prior_maps import MapFiles, ObservedPoints, PriorDepth
 from gs2d.data.scene import Scene

@@ -13,8 +13,7 @@ import torch
 from fake_backends import lacking
 from gs2d.config.presets import appearance, two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Recipe
-from gs2d.config.robust import DenseStart, Removal
+from gs2d.config.recipe import DenseStart, Recipe, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera
 from gs2d.core.sh import rgb_to_sh0

@@ -13,21 +13,23 @@ from functools import partial
 from typing import Any
 
 from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES
 from gs2d.config.recipe import (
     ALL,
     ALPHA,
     SH,
+    DenseStart,
+    DepthPrior,
     GradDensify,
     LearningRates,
     LossTerm,
+    NormalPrior,
     Recipe,
+    Removal,
     Stage,
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
 from gs2d.config.registry import Register, Registry, did_you_mean
-from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
 

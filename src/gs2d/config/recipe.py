@@ -16,15 +16,19 @@ from typing import Any
 from gs2d.config.actions import Action
 from gs2d.config.densify import Densify
 from gs2d.config.loss_registry import LOSSES
-from gs2d.config.prior_settings import DepthPrior, NormalPrior, check_priors
 from gs2d.config.quantities import QUANTITIES, Quantity
-from gs2d.config.robust import DenseStart, Removal, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
 LARGEST_SEED = 2**63 - 1  # the largest of torch
 DEPTH_KINDS = ("mean", "median", "transmittance")
+SOURCES = ("auto", "sparse", "sensor", "relative")  # of known depths
+SPACES = ("auto", "disparity", "depth")
+ALIGNMENTS = ("points", "rendered")
+AXES = ("auto", "opencv", "opengl")
+FEW_VIEWS = 24  # training images, or fewer, that training would overfit without dropout
+MAX_ANGLE = 35.0  # degrees between the viewing directions of images that a dense start compares
 
 
 @dataclass(frozen=True)
@@ -248,6 +252,101 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class DepthPrior:
+    """Source of known depths, and how much they count (``losses/known_maps.py``, ``losses/prior_formulas.py``)."""
+
+    # "sparse": sparse points of the capture; "sensor": depth maps in units of the capture times a factor; "relative":
+    # depth maps with an unknown scale and shift for each view; "auto": sensor maps, relative maps or sparse points,
+    # whichever the capture has first
+    source: str = "auto"
+    # final_factor, decay_steps: the weight of the loss decays log-linearly to this fraction over ``decay_steps``
+    # iterations of the run, because the images are more accurate in the end
+    final_factor: float = 0.01
+    decay_steps: int = 30_000
+    min_track: int = 3  # smallest number of images of a sparse point
+    max_error: float = 2.0  # px; largest mean reprojection error of a sparse point
+    # World units of a value of 1 in a sensor map. None: the unit that fits the sparse points (the scale of COLMAP is
+    # arbitrary); without points that of the capture, 0.001 for integers, or 1.
+    unit: float | None = None
+    # Quantity that relative maps are linear in: "disparity" (1 / depth) or "depth"; "auto": the one that fits the
+    # sparse points better.
+    space: str = "auto"
+    # Scale and shift of a relative map are fitted to its sparse "points", or to the rendered depth if there are too
+    # few; "rendered": always to the rendered depth, in each iteration.
+    align: str = "points"
+    start: bool = True  # whether training also starts from points on the maps, as many as the recipe's ``init_points``
+
+    def weight_at(self, iteration: int) -> float:
+        """Return the factor of the weight at an iteration of the run (1-based)."""
+        return _decayed(self.final_factor, iteration / self.decay_steps)
+
+
+@dataclass(frozen=True)
+class NormalPrior:
+    """Settings of the loss on known normals."""
+
+    # Axes of the maps in the camera frame: "opencv" (x right, y down, z forward), "opengl" (x right, y up, z back) or
+    # "auto", those in which normals face the camera.
+    axes: str = "auto"
+    # final_factor, decay_steps: see :class:`DepthPrior`
+    final_factor: float = 0.01
+    decay_steps: int = 30_000
+
+    def weight_at(self, iteration: int) -> float:
+        """Return the factor of the weight at an iteration of the run (1-based)."""
+        return _decayed(self.final_factor, iteration / self.decay_steps)
+
+
+def _decayed(final_factor: float, fraction: float) -> float:
+    """Return a factor that falls log-linearly from 1 to ``final_factor`` for fractions in [0, 1]."""
+    return math.exp(min(max(fraction, 0.0), 1.0) * math.log(final_factor))
+
+
+@dataclass(frozen=True)
+class DenseStart:
+    """Start from points of a plane sweep over neighbouring images (``training/start/plane_sweep.py``).
+
+    Sparse points of the capture give the depth range. Without any, the scene bounds do, inside the silhouettes of
+    images with an alpha channel (``training/start/sweep_range.py``).
+    """
+
+    side: int = 200  # px; images are downscaled by a whole factor until their longer side is about this
+    # Images that each image is compared with. The best two count, so that a point may be hidden from the others.
+    neighbours: int = 4
+    min_angle: float = 2.0  # degrees; smallest angle between the viewing directions of neighbours
+    cell: float = 3.0  # px; one splat starts in each cell of this many pixels of the downscaled images
+    # Whether colour, opacity and size of the splats are fitted to the images (``training/start/start_fit.py``).
+    # Otherwise they start as splats of sparse points do.
+    fit: bool = False
+    required: bool = True  # whether training stops if no depths agree. Otherwise it reports that and starts without.
+    # Whether splats on a sphere around the scene are added (``training/start/background_sphere.py``).
+    sphere: bool = False
+    # Whether the training cameras are adjusted to the photographs first, if those show that the cameras are off
+    # (``training/start/camera_adjustment.py``).
+    adjust: bool = False
+
+
+@dataclass(frozen=True)
+class Removal:
+    """Remove floaters: splats that something speaks against and that the training images do not miss.
+
+    Depth maps, sizes and colours only propose splats; the training images decide (``training/robust/trial.py``). In the
+    same iterations, large splats on surfaces of known depth shrink (docs/notebook/floaters.md).
+    """
+
+    every: int = 50  # iterations between proposals, and from the start to the first
+    # Fraction of its opacity that a splat loses every ten iterations, in stages that train the opacity of all splats.
+    # Splats that several images need recover at once; floaters that only one image supports do not.
+    decay: float = 0.01
+    # Fraction of the splats that each iteration leaves out at random, with at most ``FEW_VIEWS`` training images. With
+    # more, dropout gains on some captures and loses on others.
+    dropout: float = 0.1
+    # Also propose splats in the colour of the background. Set for captures in front of an even, unlit backdrop, where
+    # such splats change no training image and hide what new views should show.
+    backdrop: bool = False
+
+
+@dataclass(frozen=True)
 class Recipe:
     """A training method: stages in order, and settings for all of them.
 
@@ -376,11 +475,11 @@ def validate(recipe: Recipe) -> Recipe:
         require(moves, f"{where}: poses need a stage that trains the means of all splats, got none")
     if "intrinsics" in learned:
         require("poses" in learned, f"{where}: intrinsics need poses in learned, got none; add them")
-    check_priors(where, recipe.depth_prior, recipe.normal_prior)
+    _check_priors(where, recipe.depth_prior, recipe.normal_prior)
     if recipe.fused_depth is not None:
         one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)
     number(f"{where}: mip_px", recipe.mip_px, low=0.0)
-    check_robust(where, recipe.dense_start, recipe.removal)
+    _check_robust(where, recipe.dense_start, recipe.removal)
     names = [stage.name for stage in recipe.stages]
     for name in names:
         require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")
@@ -391,6 +490,45 @@ def validate(recipe: Recipe) -> Recipe:
     for stage in recipe.stages:
         _check_stage(f"stage {stage.name!r}", stage, groups)
     return recipe
+
+
+def _check_priors(where: str, depth: DepthPrior | None, normal: NormalPrior | None) -> None:
+    """Raise RecipeError for an invalid value."""
+    for name, value in (("depth_prior", depth), ("normal_prior", normal)):
+        at = f"{where}: {name}"
+        if value is None:
+            continue
+        fraction = number(f"{at}.final_factor", value.final_factor, low=0.0)
+        require(0 < fraction <= 1, f"{at}.final_factor must be in (0, 1], got {fraction}")
+        integer(f"{at}.decay_steps", value.decay_steps, low=1)
+    if normal is not None:
+        one_of(f"{where}: normal_prior.axes", normal.axes, AXES)
+    if depth is None:
+        return
+    at = f"{where}: depth_prior"
+    one_of(f"{at}.source", depth.source, SOURCES)
+    one_of(f"{at}.space", depth.space, SPACES)
+    one_of(f"{at}.align", depth.align, ALIGNMENTS)
+    integer(f"{at}.min_track", depth.min_track, low=2)
+    require(number(f"{at}.max_error", depth.max_error, low=0.0) > 0, f"{at}.max_error must be positive, got 0")
+    if depth.unit is not None:
+        require(number(f"{at}.unit", depth.unit, low=0.0) > 0, f"{at}.unit must be positive, got 0")
+
+
+def _check_robust(where: str, start: DenseStart | None, removal: Removal | None) -> None:
+    """Raise RecipeError for a value that cannot be trained with."""
+    if removal is not None:
+        integer(f"{where}: removal.every", removal.every, low=1)
+        for name in ("decay", "dropout"):
+            value = number(f"{where}: removal.{name}", getattr(removal, name), low=0.0)
+            require(value < 1, f"{where}: removal.{name} must be below 1, got {value}: nothing would be drawn")
+    if start is not None:
+        at = f"{where}: dense_start"
+        integer(f"{at}.side", start.side, low=16)
+        integer(f"{at}.neighbours", start.neighbours, low=1)
+        number(f"{at}.cell", start.cell, low=1.0)
+        angle = number(f"{at}.min_angle", start.min_angle, low=0.0)
+        require(angle < MAX_ANGLE, f"{at}.min_angle must be below {MAX_ANGLE:g} degrees, got {angle}")
 
 
 def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:

@@ -15,8 +15,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from gs2d.config.densify import Densify
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
-from gs2d.config.recipe import GradDensify, LearningRates, Recipe, Stage
+from gs2d.config.recipe import DepthPrior, GradDensify, LearningRates, NormalPrior, Recipe, Stage
 from gs2d.errors import RecipeError
 
 MIN_DENSIFICATIONS = 10

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
-from gs2d.config.recipe import Recipe
+from gs2d.config.recipe import DepthPrior, NormalPrior, Recipe
 from gs2d.core.memory_limit import cache_bytes
 from gs2d.data.prior_maps import ObservedPoints, PointsInView, PriorDepth
 from gs2d.data.scene import Scene, View

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gs2d.config.loss_registry import register_loss
-from gs2d.config.prior_settings import DepthPrior, NormalPrior
-from gs2d.config.recipe import Recipe
+from gs2d.config.recipe import DepthPrior, NormalPrior, Recipe
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
 from gs2d.losses.base import SETTINGS, Loss, LossView

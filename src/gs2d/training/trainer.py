@@ -29,7 +29,6 @@ from gs2d.training import events
 from gs2d.training.actions.entry_action import EntryAction, StageEntry
 from gs2d.training.cached_objective import CachedViews, choose_objective
 from gs2d.training.densify.densifier import Densifier, Surroundings, densifier_of
-from gs2d.training.first_splats import first_splats
 from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity
 from gs2d.training.objective import (
     FullRender,
@@ -367,8 +366,7 @@ class Trainer:
         options = self._options
         generator = torch.Generator().manual_seed(self.recipe.seed)
         near = self.protocol.near_for(self.scene.extent)
-        start = self.recipe, self._robust, near, generator, options.dtype
-        splats, event = first_splats(*start, init, options.within)
+        splats, event = self._robust.first_splats(near, generator, options.dtype, init, options.within)
         self._pending = [event]
         return TrainState(splats, generator, learned=self.learned.start(splats.means, {"exposure": options.exposures}))
 

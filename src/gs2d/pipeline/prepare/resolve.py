@@ -16,8 +16,7 @@ from gs2d.config.presets import (
     with_robustness,
 )
 from gs2d.config.protocols import BLACK, Protocol, get_protocol
-from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import FEW_VIEWS
+from gs2d.config.recipe import FEW_VIEWS, Recipe, validate
 from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides
 from gs2d.data import Scene

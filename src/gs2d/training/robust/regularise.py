@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.config.recipe import Recipe, Stage
-from gs2d.config.robust import FEW_VIEWS
+from gs2d.config.recipe import FEW_VIEWS, Recipe, Stage
 from gs2d.core.splats import Splats
 
 NOT_DRAWN = -30.0  # logit of an opacity far below ``alpha_min``

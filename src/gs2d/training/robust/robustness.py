@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from gs2d.config.protocols import BLACK
-from gs2d.config.recipe import Recipe, Stage
-from gs2d.config.robust import DenseStart, Removal
+from gs2d.config.recipe import DenseStart, Recipe, Removal, Stage
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
@@ -35,12 +34,14 @@ from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.rows import keep_rows
 from gs2d.training.start.background_sphere import sphere_points
 from gs2d.training.start.camera_adjustment import adjust_cameras
-from gs2d.training.start.initialize import Initial
+from gs2d.training.start.initialize import initial_splats, splats_as_start
+from gs2d.training.start.known_points import with_known_points
 from gs2d.training.start.plane_sweep import SmallView, Sweep, sweep_views
 from gs2d.training.start.start_fit import fit_start
 from gs2d.training.start.start_points import start_points
 from gs2d.training.state import TrainState
 
+MIN_START = 10  # a dense start with fewer splats gives way to the splats of ``init``
 PARTS = 5  # of a stage: at the end of each, all proposed splats are tried again, also those that were missed before
 FEW_NEW = 0.002  # fraction of the splats: fewer new proposals wait, because a trial costs about 50 iterations
 SHOWN = 0.25  # fraction of the images, and at least 3, that must show a surface on which splats are kept small
@@ -124,15 +125,34 @@ class Robustness:
             self._free = FreeSpaceMaps(sweep, spilled=scene.ahead > 0)
             self._images, self._neighbours = sweep.views, sweep.neighbours
 
-    @property
-    def starts_densely(self) -> bool:
-        """Whether training starts from a plane sweep."""
-        return self._recipe.dense_start is not None and not self.lacks
+    def first_splats(
+        self,
+        near: float,
+        generator: torch.Generator,
+        dtype: torch.dtype,
+        init: Splats | None = None,
+        within: Callable[[Tensor], Tensor] | None = None,
+    ) -> tuple[Splats, events.Initialised]:
+        """Return the splats that training starts from, and the event that reports them. Frees the sweep.
 
-    def fitted(self, first: Initial) -> Splats:
-        """Return the first splats, fitted if the dense start does that. Frees the sweep."""
-        sweep, self._sweep = self._sweep, None
-        return first.splats if sweep is None else fit_start(first.splats, sweep, first.sized)
+        ``near`` (world units): points nearer to a camera are dropped. ``init``: splats to start from, unless a dense
+        start finds enough others. ``within``: returns which points [M, 3] belong to the trained part of the scene, [M]
+        bool.
+        """
+        recipe, dense = self._recipe, self._recipe.dense_start is not None and not self.lacks
+        if init is None or dense:
+            start = with_known_points(self.scene, recipe)
+            options = {"random_points": recipe.init_points, "near": near, "generator": generator, "dtype": dtype}
+            initial = initial_splats(start, sh_degree=recipe.sh_degree, **options)  # type: ignore[arg-type]
+            source = initial.source if start is self.scene else "depths"
+            source = "sweep" if source == "points" and dense else source
+            sweep, self._sweep = self._sweep, None
+            splats = initial.splats if sweep is None else fit_start(initial.splats, sweep, initial.sized)
+            splats = splats if within is None else splats.rows(within(splats.means))
+            if init is None or len(splats) >= MIN_START:
+                return splats, events.Initialised(len(splats), source, initial.dropped, self.lacks)
+        splats = splats_as_start(init, sh_degree=recipe.sh_degree, dtype=dtype)
+        return splats, events.Initialised(len(splats), "splats", 0)
 
     def move_to(self, device: torch.device | str) -> None:
         """Move all tensors to a device."""

@@ -17,7 +17,7 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from gs2d.config.robust import DenseStart
+from gs2d.config.recipe import DenseStart
 from gs2d.core.transforms import se3_exp
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.config.robust import MAX_ANGLE, DenseStart
+from gs2d.config.recipe import MAX_ANGLE, DenseStart
 from gs2d.core.memory import trim
 from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.spill import Spilled

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gs2d.config.robust import MAX_ANGLE, DenseStart
+from gs2d.config.recipe import MAX_ANGLE, DenseStart
 from gs2d.core.transforms import nearest_distances
 from gs2d.data.scene import PointCloud, Scene
 from gs2d.errors import DataError
