@@ -58,7 +58,7 @@ def suggestion(path: Path, needed: str) -> str:
         if run is not None:
             return f"; give the run folder {run}"
         if capture is not None:
-            return _with_training(capture)
+            return f"; `gs2d train {_quoted(capture)} --out RUN` makes a run of it"
         if holds_photographs(photos):
             return _with_cameras(photos)
         return "; give a folder that `gs2d train` or `gs2d reconstruct` made"
@@ -115,11 +115,6 @@ def _capture_of(run: Path) -> Path | None:
     except (OSError, ValueError, LookupError, TypeError):
         return None
     return capture if capture.is_dir() else None
-
-
-def _with_training(capture: Path) -> str:
-    """Return how to make a run from a capture."""
-    return f"; `gs2d train {_quoted(capture)} --out RUN` makes a run of it"
 
 
 def _with_cameras(photos: Path) -> str:

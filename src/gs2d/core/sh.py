@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -73,6 +74,28 @@ def harmonics(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
             -C3[0] * x * (x * x - 3 * y * y),
         ]
     return basis
+
+
+@cache
+@torch.enable_grad()
+def turns_of_harmonics(degree: int) -> Tensor:
+    """Return L [3, K-1, K-1] float64, the derivative of the harmonics of degrees 1 to ``degree`` by a rotation.
+
+    Y_k(g + w x g) = Y_k(g) + sum over axes a and harmonics j of w_a L_akj Y_j(g), for small w. Harmonics of one degree
+    map to each other. L is fitted and then rounded: the squares of all entries are multiples of 1/4.
+    """
+    count = num_coefficients(degree) - 1
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(10 * count, 3, generator=generator, dtype=torch.float64)
+    directions = (directions / directions.norm(dim=1, keepdim=True)).requires_grad_()
+    basis = sh_basis(directions, degree)[:, 1:]
+    changes = []
+    for k in range(count):
+        (slope,) = torch.autograd.grad(basis[:, k].sum(), directions, retain_graph=True)
+        changes.append(torch.linalg.cross(directions.detach(), slope))
+    wanted = torch.stack(changes, dim=2).flatten(1)  # [10 (K-1), 3 (K-1)]
+    turns = torch.linalg.lstsq(basis.detach(), wanted).solution.T.reshape(3, count, count)
+    return turns.sign() * ((4 * turns * turns).round() / 4).sqrt()
 
 
 def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:

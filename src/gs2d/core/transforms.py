@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
-from gs2d.core.sh import num_coefficients, sh_basis
+from gs2d.core.sh import turns_of_harmonics
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 
@@ -209,24 +209,6 @@ def camera_outliers(cameras: Sequence[Camera]) -> dict[int, float]:
     return {int(i): float(distances[i] / typical) for i in far}
 
 
-def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
-    """Return the matrix [K-1, K-1] that rotates SH coefficients of degrees 1 to ``degree`` with the world.
-
-    It satisfies Y(R d) c' = Y(d) c for directions d. The block of each degree is solved from more directions than it
-    has functions, exact to rounding.
-    """
-    directions = torch.from_numpy(np.random.default_rng(0).normal(size=(64, 3)))
-    directions = directions / directions.norm(dim=1, keepdim=True)
-    turned = directions @ torch.from_numpy(np.asarray(rotation, np.float64)).T
-    before, after = (np.asarray(sh_basis(d, degree)) for d in (directions, turned))
-    count = num_coefficients(degree)
-    matrix = np.zeros((count, count))
-    for level in range(degree + 1):
-        block = slice(level**2, (level + 1) ** 2)
-        matrix[block, block] = np.linalg.lstsq(after[:, block], before[:, block], rcond=None)[0]
-    return matrix[1:, 1:]
-
-
 def transform_splats(splats: Splats, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Splats:
     """Apply x -> scale * rotation @ x + translation to splats, including their SH.
 
@@ -234,14 +216,14 @@ def transform_splats(splats: Splats, scale: float, rotation: np.ndarray, transla
     """
     from scipy.spatial.transform import Rotation
 
-    R = torch.from_numpy(np.asarray(rotation, np.float64))
-    x, y, z, w = Rotation.from_matrix(np.asarray(rotation, np.float64)).as_quat()
+    R, turn = torch.from_numpy(np.asarray(rotation, np.float64)), Rotation.from_matrix(np.asarray(rotation, np.float64))
+    x, y, z, w = turn.as_quat()
     left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
     a = {name: tensor.detach().to("cpu", torch.float64) for name, tensor in splats.items()}
     shN = a["shN"]
     if shN.shape[1]:
-        turn = torch.from_numpy(harmonics_rotation(rotation, splats.sh_degree))
-        shN = torch.einsum("jk,nkc->njc", turn, shN)
+        rate = torch.einsum("a,ajk->jk", torch.from_numpy(turn.as_rotvec()), turns_of_harmonics(splats.sh_degree))
+        shN = torch.einsum("jk,nkc->njc", torch.linalg.matrix_exp(rate), shN)  # orthogonal: coefficients turn as values
     return Splats(
         means=scale * (a["means"] @ R.T) + torch.from_numpy(np.asarray(translation, np.float64)),
         quats=a["quats"] @ left.T,

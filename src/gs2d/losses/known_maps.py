@@ -22,11 +22,6 @@ ASKED_VIEWS = 20  # views that determine the unit and the space of the maps
 FACING = 0.9  # least fraction of normals that face the camera
 
 
-def has_priors(recipe: Recipe) -> bool:
-    """Return whether a recipe uses known depths or normals."""
-    return recipe.depth_prior is not None or recipe.normal_prior is not None
-
-
 @dataclass(frozen=True, eq=False)
 class DepthPlan:
     """Interpretation of the known depths of a capture."""

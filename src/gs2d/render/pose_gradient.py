@@ -8,14 +8,13 @@ directions of view-dependent colours, and the normal image, which is in the worl
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.core.sh import C0, num_coefficients, sh_basis
+from gs2d.core.sh import C0, num_coefficients, sh_basis, turns_of_harmonics
 from gs2d.core.splats import Splats
 from gs2d.kernels.c_structures import arguments_of
 from gs2d.kernels.library import Library, library_for
@@ -129,28 +128,6 @@ def _native_wrench(library: Library, center: Tensor, count: int, **tensors: Tens
     if library.call("gs2d_camera_wrench", moved, sums) != 0:
         raise MemoryError("gs2d_camera_wrench could not allocate its sums")
     return sums[0], sums[1]
-
-
-@cache
-@torch.enable_grad()
-def turns_of_harmonics(degree: int) -> Tensor:
-    """Return L [3, K-1, K-1] float64, the derivative of the harmonics of degrees 1 to ``degree`` by a rotation.
-
-    Y_k(g + w x g) = Y_k(g) + sum over axes a and harmonics j of w_a L_akj Y_j(g), for small w. Harmonics of one degree
-    map to each other. L is fitted and then rounded: the squares of all entries are multiples of 1/4.
-    """
-    count = num_coefficients(degree) - 1
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(10 * count, 3, generator=generator, dtype=torch.float64)
-    directions = (directions / directions.norm(dim=1, keepdim=True)).requires_grad_()
-    basis = sh_basis(directions, degree)[:, 1:]
-    changes = []
-    for k in range(count):
-        (slope,) = torch.autograd.grad(basis[:, k].sum(), directions, retain_graph=True)
-        changes.append(torch.linalg.cross(directions.detach(), slope))
-    wanted = torch.stack(changes, dim=2).flatten(1)  # [10 (K-1), 3 (K-1)]
-    turns = torch.linalg.lstsq(basis.detach(), wanted).solution.T.reshape(3, count, count)
-    return turns.sign() * ((4 * turns * turns).round() / 4).sqrt()
 
 
 def pose_gradient(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:

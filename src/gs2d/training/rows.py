@@ -18,7 +18,8 @@ from gs2d.training.state import TrainState
 
 def keep_rows(state: TrainState, mask: Tensor) -> None:
     """Drop every row where ``mask`` (bool [N]) is False; the others keep their order."""
-    append_rows(state, _no_rows(state.splats), keep=mask)
+    nothing = Splats(**{name: tensor[:0] for name, tensor in state.splats.items()})
+    append_rows(state, nothing, keep=mask)
 
 
 @torch.no_grad()
@@ -74,7 +75,3 @@ def _kept(state: TrainState, keep: Tensor | None) -> Tensor | None:
         raise ShapeError(f"mask must be bool [N], got {keep.dtype}")
     kept = keep.nonzero().squeeze(1)
     return None if len(kept) == len(keep) else kept
-
-
-def _no_rows(splats: Splats) -> Splats:
-    return Splats(**{name: tensor[:0] for name, tensor in splats.items()})

@@ -25,7 +25,7 @@ from gs2d.errors import DataError, RecipeError, RunError, ShapeError
 from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.io.run_dir import RUN_JSON, SPLATS, RunFolder, open_run, versions
-from gs2d.losses.known_maps import DepthPlan, Priors, has_priors
+from gs2d.losses.known_maps import DepthPlan, Priors
 from gs2d.losses.prior_formulas import NormalTarget
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_refined_poses
 from gs2d.pipeline.prepare.limits import use_threads
@@ -409,7 +409,7 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
 
     Raises DataError if a map is broken, or no view has the priors of the recipe.
     """
-    if not has_priors(recipe):
+    if recipe.depth_prior is None and recipe.normal_prior is None:
         return digest
     priors = Priors(scene, recipe, limit_bytes=0)
     extended = hashlib.sha256(digest.encode())

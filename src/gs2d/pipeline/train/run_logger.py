@@ -253,7 +253,8 @@ class RunLogger:
             self._write_splats()
         self._signals.release()
         release_buffers()  # scoring has its own
-        self.score(index, self._facts())
+        with self._attempted_at_end(index):
+            self._score_stage(index, self._facts())
         if not self._is_last(index):
             self._phase()
 
@@ -265,11 +266,6 @@ class RunLogger:
         probes = scene.test or scene.train
         probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
         return mean_psnr(self._loaded.trained(self._trainer.drawn, scene), probes)
-
-    def score(self, index: int, facts: Mapping[str, Any]) -> None:
-        """Score and draw a finished stage; ``facts`` go into its entry. After the last stage, errors are reported."""
-        with self._attempted_at_end(index):
-            self._score_stage(index, facts)
 
     def _take_over(self, index: int, facts: Mapping[str, Any]) -> None:
         """Draw a stage of another run or process, and score it if its scores or measures are missing."""
