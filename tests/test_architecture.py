@@ -83,7 +83,7 @@ INSIDE = {
         "cpu_cached pose_gradient exposure_transform": 4,
         "cpu_passes cuda_step reference_contributors": 3,
         "cuda_passes reference_pairs": 2,
-        "pair_budget whole_step cuda_works reference_projection reference_transmittance": 1,
+        "pair_budget whole_step cuda_works reference_projection": 1,
         "types": 0,
     },
     "training": {

@@ -41,30 +41,15 @@ CONSTANTS = (
 
 
 class Rasterization(NamedTuple):
-    """Images of C cameras and radii of N splats, as defined in the contract (``gs2d.render.api``).
+    """Images of C cameras and radii of N splats, as defined in the contract (``gs2d.render.api``)."""
 
-    Attributes
-    ----------
-    colors : Tensor [C, H, W, D]
-        Blended channels over the background.
-    alphas : Tensor [C, H, W, 1]
-    normals : Tensor [C, H, W, 3]
-        World frame, facing the camera, summed by weight and not normalised.
-    depth_mean, depth_median : Tensor [C, H, W, 1]
-        World units; 0 where nothing was hit. The mean is divided by alpha.
-    distortion : Tensor [C, H, W, 1]
-        Squared differences of mapped depth.
-    radii : Tensor [C, N]
-        px, half the longer side of each splat's box; 0 for splats that touch no pixel. No gradient.
-    """
-
-    colors: Tensor
-    alphas: Tensor
-    normals: Tensor
-    depth_mean: Tensor
-    depth_median: Tensor
-    distortion: Tensor
-    radii: Tensor
+    colors: Tensor  # [C, H, W, D], blended channels over the background
+    alphas: Tensor  # [C, H, W, 1]
+    normals: Tensor  # [C, H, W, 3], world frame, facing the camera, summed by weight and not normalised
+    depth_mean: Tensor  # [C, H, W, 1] world units, divided by alpha; 0 where nothing was hit
+    depth_median: Tensor  # [C, H, W, 1] world units; 0 where nothing was hit
+    distortion: Tensor  # [C, H, W, 1], squared differences of mapped depth
+    radii: Tensor  # [C, N] px, half the longer side of each box; 0 for splats that touch no pixel; no gradient
 
 
 class SplatTensors(NamedTuple):
