@@ -202,7 +202,10 @@ class Backend:
         torch_kernels.adam_step(updates, beta1=beta1, beta2=beta2, eps=eps)
 
     def accumulate(self, signed: Tensor, absolute: Tensor, count: Tensor, signal: Tensor, radii: Tensor) -> None:
-        """Add the norms of a densification signal [N, 2 or 4] of the splats with a radius, in place."""
+        """Add the norms of a densification signal [N, 2 or 4] of the splats with a radius to sums [N], in place.
+
+        It is the gradient of the screen probe: signed in columns 0:2, absolute in 2:4, which ``absolute`` is for.
+        """
         torch_kernels.accumulate(signed, absolute, count, signal, radii)
 
     def assign(self, target: Tensor, value: Tensor) -> None:

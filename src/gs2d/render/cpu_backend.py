@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
 from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
-from gs2d.errors import BackendError
-from gs2d.kernels import densify_stats, library, native_adam
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels import library, native_adam
 from gs2d.kernels.library import Library
 from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.native_losses import NativeLosses
@@ -109,8 +110,21 @@ class CpuBackend(KernelBackend):
         native_adam.adam_step(updates, beta1=beta1, beta2=beta2, eps=eps)
 
     def accumulate(self, signed: Tensor, absolute: Tensor, count: Tensor, signal: Tensor, radii: Tensor) -> None:
-        """Add a densification signal in one pass; equal to the reference to rounding."""
-        densify_stats.accumulate(signed, absolute, count, signal, radii)
+        """Add a densification signal in one pass; equal to the reference to rounding.
+
+        Raises ShapeError if shapes differ, a sum is not contiguous, or a tensor has another dtype or device than the
+        library.
+        """
+        columns = 4 if signal.dim() == 2 and signal.shape[1] == 4 else 2
+        sums = {"signed": signed, "absolute": absolute, "count": count}
+        shapes = {"signal": (signal, f"N {columns}"), "radii": (radii, "N")}
+        check_shapes(shapes | {name: (tensor, "N") for name, tensor in sums.items()})
+        for name, tensor in sums.items():
+            if not tensor.is_contiguous():
+                raise ShapeError(f"{name} must be contiguous to be changed in place")
+        native = self._library()
+        signal, radii, *changed = native.arrays(signal=signal, radii=radii, **sums)
+        native.call("gs2d_accumulate_signal", signal, columns, radii, len(radii), *changed)
 
     def first_not_finite(self, tensors: Sequence[Tensor]) -> int | None:
         """Return the index of the first tensor with a NaN or an infinity, in a tenth of the time of six sums."""

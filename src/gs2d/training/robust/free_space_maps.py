@@ -18,7 +18,7 @@ from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.spill import Spilled
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.kernels.native_free_space import SeenSpace, look_at_free_space
+from gs2d.kernels.library import library_for
 from gs2d.training.start.plane_sweep import SWEEP_BYTES, Sweep
 
 NEARER = 0.9  # space nearer than this fraction of the depth is free, as depths are accurate to a few percent
@@ -131,10 +131,29 @@ def _free_view(sweep: Sweep, index: int) -> FreeView:
 def _look(
     view: FreeView, ends: Tensor, reach: Tensor, limit: Tensor, radius: float, against: Tensor, support: Tensor
 ) -> None:
-    """Count one image for each splat [N], natively if possible, else in torch."""
-    seen = SeenSpace(view.project, view.center, limit, view.known, radius, 1 - NEARER)
-    if not look_at_free_space(ends, reach, seen, against, support):
+    """Count one image for each splat [N], natively if possible, else in torch.
+
+    ``reach`` [N] is the largest distance of an end of each splat from its centre, world units.
+    """
+    if not look_at_free_space(view, ends, reach, limit, radius, against, support):
         look_at_free_space_reference(view, ends, limit, radius, against, support)
+
+
+def look_at_free_space(
+    view: FreeView, ends: Tensor, reach: Tensor, limit: Tensor, radius: float, against: Tensor, support: Tensor
+) -> bool:
+    """Count natively; return False and do nothing without the native library."""
+    library = library_for(ends)
+    if library is None or library.dtype != torch.float32:
+        return False
+    tensors = {"ends": ends, "reach": reach, "project": view.project, "center": view.center}
+    tensors |= {"limit": limit, "known": view.known}
+    given = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    height, width = limit.shape
+    sizes = {"count": ends.shape[1], "places": len(ends), "height": height, "width": width}
+    limits = {"radius": radius, "fraction": 1 - NEARER}
+    library.call("gs2d_free_space", **sizes, **limits, **given, against=against, support=support)
+    return True
 
 
 def look_at_free_space_reference(
