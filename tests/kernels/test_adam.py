@@ -13,9 +13,10 @@ from torch.optim.adam import adam
 
 from emulate import Emulator
 from gs2d.errors import ShapeError
+from gs2d.kernels.adam_update import AdamUpdate
 from gs2d.kernels.cuda import cuda_adam as cuda
 from gs2d.kernels.library import Library, load
-from gs2d.kernels.native_adam import AdamUpdate, adam_step, first_not_finite
+from gs2d.render.cpu_backend import CpuBackend
 
 WRITTEN = ("parameter", "mean", "square")
 BETAS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
@@ -56,7 +57,7 @@ def equal(a: AdamUpdate, b: AdamUpdate) -> bool:
 def step(request: pytest.FixtureRequest) -> Callable[..., None]:
     """Return the step function of each device."""
     if request.param == "native":
-        return partial(adam_step, **BETAS, library=load())
+        return partial(CpuBackend(load()).adam_step, **BETAS)
     return partial(cuda.adam_step, **BETAS, launcher=request.getfixturevalue("emulator"))
 
 
@@ -75,7 +76,7 @@ def assert_torchs_step(step: Callable[..., None], count: int, dtype: torch.dtype
 
 def test_it_takes_torchs_fused_step(any_native: Library) -> None:
     """1000 rows of 45 are several chunks of 8192 elements; 1001 rows of 1 end within a vector."""
-    assert_torchs_step(partial(adam_step, **BETAS, library=any_native), 1000, any_native.dtype)
+    assert_torchs_step(partial(CpuBackend(any_native).adam_step, **BETAS), 1000, any_native.dtype)
 
 
 def test_the_cuda_kernel_takes_torchs_fused_step(emulator: Emulator) -> None:
@@ -95,7 +96,7 @@ def test_the_bits_do_not_depend_on_threads(native: Library) -> None:
     for threads in (1, 2, 5):
         native.use_threads(threads)
         updates = [attribute(3000, shape, torch.float32, seed=k) for k, shape in enumerate(SHAPES)]
-        adam_step(updates, **BETAS, library=native)
+        CpuBackend(native).adam_step(updates, **BETAS)
         results.append(updates)
     assert all(equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
@@ -131,7 +132,7 @@ def test_rows_that_are_not_there_change_nothing(native: Library, rows: list[int]
     good, bad = attribute(5, (3,), torch.float32), attribute(5, (3,), torch.float32, seed=1)
     before = copied(good)
     with pytest.raises(ShapeError, match="parameter"):
-        adam_step([good, replace(bad, rows=torch.tensor(rows))], **BETAS, library=native)
+        CpuBackend(native).adam_step([good, replace(bad, rows=torch.tensor(rows))], **BETAS)
     assert equal(good, before)
 
 
@@ -143,9 +144,9 @@ def test_the_first_tensor_that_is_not_finite_is_found_wherever_it_is(any_native:
         for at in (0, size // 2, size - 1):
             tensors = [torch.full((n,), large, dtype=any_native.dtype) for n in sizes]
             assert (
-                first_not_finite(tensors, library=any_native) is None
+                CpuBackend(any_native).first_not_finite(tensors) is None
             )  # the sum overflows although each element is finite
             tensors[which][at] = value
             tensors[-1][-1] = value
-            assert first_not_finite(tensors, library=any_native) == which
-    assert first_not_finite([torch.empty(0, dtype=any_native.dtype)], library=any_native) is None
+            assert CpuBackend(any_native).first_not_finite(tensors) == which
+    assert CpuBackend(any_native).first_not_finite([torch.empty(0, dtype=any_native.dtype)]) is None

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from gs2d.kernels.native_adam import AdamUpdate
+from gs2d.kernels.adam_update import AdamUpdate
 
 
 @torch.no_grad()

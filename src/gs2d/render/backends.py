@@ -19,8 +19,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels import torch_kernels
+from gs2d.kernels.adam_update import AdamUpdate
 from gs2d.kernels.loss_operations import LossOperations
-from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.tsdf import FusionOnDevice
 from gs2d.render.types import Features, RasterSettings, RenderOutput
 from gs2d.render.whole_step import WholeStep

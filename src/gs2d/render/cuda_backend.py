@@ -12,10 +12,10 @@ from torch.nn.functional import pad
 
 from gs2d.core.splats import ATTRIBUTES, IMAGES
 from gs2d.kernels import torch_kernels
+from gs2d.kernels.adam_update import AdamUpdate
 from gs2d.kernels.cuda import cuda_adam, diagnose, launch
 from gs2d.kernels.cuda.cuda_losses import CudaLosses
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.kernels.native_adam import AdamUpdate
 from gs2d.kernels.tsdf import FusionOnDevice
 from gs2d.render.backends import register_backend
 from gs2d.render.cuda_passes import (

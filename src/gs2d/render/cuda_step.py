@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.kernels.adam_update import AdamUpdate, bias_corrections
 from gs2d.kernels.cuda.cuda_adam import adam_work
 from gs2d.kernels.cuda.cuda_losses import MEAN_PIXELS, NORMAL_H, NORMAL_W, strips
 from gs2d.kernels.cuda.kernel_arguments import fill, work_of
@@ -31,7 +32,6 @@ from gs2d.kernels.cuda.sort import (
     passes_of,
     pieces_of,
 )
-from gs2d.kernels.native_adam import AdamUpdate, bias_corrections
 from gs2d.render.cuda_passes import MAX_SPLATS, PROJECTED, view_of
 from gs2d.render.cuda_works import (
     blend,

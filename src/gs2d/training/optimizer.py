@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gs2d.config.recipe import LearningRates, Stage
 from gs2d.core.splats import ATTRIBUTES
-from gs2d.kernels.native_adam import AdamUpdate
+from gs2d.kernels.adam_update import AdamUpdate
 from gs2d.render.backends import Backend
 from gs2d.render.reference_backend import PLAIN
 from gs2d.training.state import Moments, TrainState

@@ -10,7 +10,6 @@ namespace {
 
 constexpr int64_t PIECE = 8192;  // elements per task: 160 KB read and written
 
-// Layout mirrored in kernels/native_adam.py.
 struct AdamAttribute {
     real *parameter, *mean, *square;          // [N, columns]
     const real* gradient;                     // [N, columns], or [M, columns] with `compact`

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from gs2d.errors import ShapeError
+from gs2d.kernels.adam_update import AdamUpdate, bias_corrections, check_update
 from gs2d.kernels.cuda.cuda_losses import ready
 from gs2d.kernels.cuda.kernel_arguments import fill, work_of
-from gs2d.kernels.native_adam import AdamUpdate, bias_corrections, check_update
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher, Work
