@@ -119,24 +119,20 @@ def _scale_lr(lr: LearningRates, factor: float) -> LearningRates:
 def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify | Densify:
     if isinstance(densify, Densify):
         return densify.scaled(factor)
-    start, stop = round(densify.start * factor), round(densify.stop * factor)
-    cull = densify.scale_cull_start
-    densify = replace(
+    cull, wanted = densify.scale_cull_start, min(MIN_DENSIFICATIONS, count_densifications(densify))
+    scaled = replace(
         densify,
+        start=round(densify.start * factor),
+        stop=round(densify.stop * factor),
         scale_cull_start=None if cull is None else round(cull * factor),
     )
-    wanted = min(MIN_DENSIFICATIONS, count_densifications(densify))
-    every = densify.every
-    while every > 1 and count_densifications(replace(densify, start=start, stop=stop, every=every)) < wanted:
-        every -= 1
+    while scaled.every > 1 and count_densifications(scaled) < wanted:
+        scaled = replace(scaled, every=scaled.every - 1)
     if factor >= 1:
-        return replace(densify, start=start, stop=stop, every=every)
-    latest = max(0, stop - RESET_MARGIN)
+        return scaled
+    latest = max(0, scaled.stop - RESET_MARGIN)
     return replace(
-        densify,
-        start=start,
-        stop=stop,
-        every=every,
+        scaled,
         prune_grace=max(densify.prune_grace, PRUNE_GRACE),
         last_reset=latest if densify.last_reset is None else min(latest, densify.last_reset),
     )
