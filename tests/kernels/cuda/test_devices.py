@@ -93,7 +93,10 @@ print(sorted(devices), sorted(launched), pointers[0])
 """
 
 GRADIENTS = """
+from functools import partial
+
 import numpy as np
+from gs2d.kernels import loss_operations
 from gs2d.kernels.loss_operations import NormalOptions
 from render_scenes import front_camera
 from gs2d.render.types import RasterSettings
@@ -131,11 +134,14 @@ with FakeTensorMode():
             there_and_back(kernel_backend._Rasterize, needs, options, rand(9, columns), intrinsics, None, *tensors)
         there_and_back(kernel_backend._Rasterize, (*[False] * 8, True, True), options, None, None, None, *tensors)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
-    there_and_back(ops._CudaPhotometric, (True,), image, rand(24, 40, 3), mask, None, None, True, launcher)
+    fused, apply = ops.CudaLosses(launcher), loss_operations._Fused
+    comparing = partial(fused._photometric, expected=(0.8, -0.2, 0.0), wanted=True)
+    there_and_back(apply, (False, True, False, False, False), comparing, image, rand(24, 40, 3), mask, None)
     for form, weights in ((False, None), (True, plane)):
         how = NormalOptions(camera, mask, weights, form, form)
-        there_and_back(ops._CudaNormalConsistency, (True, True, True), image, plane, plane, how, 1.0, True, launcher)
-    there_and_back(ops._CudaMaskedMean, (True,), plane, mask, launcher)
+        bending = partial(fused._normal_consistency, how=how, expected=1.0, wanted=True)
+        there_and_back(apply, (False, True, True, True), bending, image, plane, plane)
+    there_and_back(apply, (False, True, False), fused._masked_mean, plane, mask)
     cuda_passes.errors(launcher, view, splats, image, mask)
     print(sorted(launched), pointers[0])
     torch.cumsum = lambda x, *_, **__: torch.arange(len(x))  # in host memory
