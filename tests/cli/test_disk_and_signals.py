@@ -60,13 +60,13 @@ def test_ctrl_c_exits_with_130_and_names_the_command_that_resumes(
 ) -> None:
     from gs2d.pipeline.train.run_logger import RunLogger
 
-    score = RunLogger.score
+    score = RunLogger._score_stage
 
     def interrupted(self: RunLogger, index: int, facts: dict[str, object]) -> None:
         score(self, index, facts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(RunLogger, "score", interrupted)
+    monkeypatch.setattr(RunLogger, "_score_stage", interrupted)
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--threads", "1", *TINY]
     assert run(words) == 130
     line = capsys.readouterr().err.strip()
