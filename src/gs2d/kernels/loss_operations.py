@@ -19,10 +19,11 @@ from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 
 Vjp: TypeAlias = Callable[..., Sequence[Tensor | None]]
-"""Gradients of the first tensors of a loss, from its tensors, which of them need one, and the cotangents.
+"""Gradients of the first tensors of a loss, from its tensors, those that it kept, which need one, and the cotangents.
 
 Of several cotangents, some may be None, which is 0.
 """
+Kept: TypeAlias = Sequence[Tensor | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,8 @@ class LossOperations:
 
     All of them raise ShapeError if shapes differ, or if a tensor has another dtype or device than the processor needs.
     A subclass implements the methods with an underscore, which get checked, contiguous tensors and return the values of
-    a loss and its :data:`Vjp`, which is only called if gradients are ``wanted``.
+    a loss, the tensors that it keeps for the backward pass, and its :data:`Vjp`, which is only called if gradients are
+    ``wanted``.
     """
 
     @property
@@ -56,20 +58,20 @@ class LossOperations:
 
     def _photometric(
         self, *images: Tensor | None, expected: tuple[float, float, float], wanted: bool
-    ) -> tuple[tuple[Tensor, Tensor, Tensor], Vjp]:
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Kept, Vjp]:
         """``images``: rendered, target, mask and target_mean."""
         raise NotImplementedError
 
     def _normal_consistency(
         self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, wanted: bool
-    ) -> tuple[Tensor, Vjp]:
+    ) -> tuple[Tensor, Kept, Vjp]:
         raise NotImplementedError
 
-    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Vjp]:
+    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Kept, Vjp]:
         """``images``: normal, alpha, flatness and mask."""
         raise NotImplementedError
 
-    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Vjp]:
+    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Kept, Vjp]:
         raise NotImplementedError
 
     def photometric(
@@ -145,20 +147,21 @@ class LossOperations:
 
 
 class _Fused(torch.autograd.Function):
-    """The values of a loss of some tensors; ``loss`` returns them and its :data:`Vjp`."""
+    """The values of a loss of some tensors; ``loss`` returns them, what it keeps and its :data:`Vjp`."""
 
     @staticmethod
-    def forward(ctx: Any, loss: Callable[..., tuple[Any, Vjp]], *tensors: Tensor | None) -> Any:
-        values, ctx.vjp = loss(*tensors)
-        ctx.save_for_backward(*tensors)  # notices if a caller changes one in place
+    def forward(ctx: Any, loss: Callable[..., tuple[Any, Kept, Vjp]], *tensors: Tensor | None) -> Any:
+        values, kept, ctx.vjp = loss(*tensors)
+        ctx.count = len(tensors)
+        ctx.save_for_backward(*tensors, *kept)  # notices if a caller changes one in place
         ctx.set_materialize_grads(isinstance(values, Tensor))
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        tensors = ctx.saved_tensors
-        gradients = ctx.vjp(tensors, ctx.needs_input_grad[1:], *cotangents)
+        tensors, kept = ctx.saved_tensors[: ctx.count], ctx.saved_tensors[ctx.count :]
+        gradients = ctx.vjp(tensors, kept, ctx.needs_input_grad[1:], *cotangents)
         return None, *gradients, *[None] * (len(tensors) - len(gradients))
 
 

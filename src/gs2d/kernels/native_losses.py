@@ -14,16 +14,16 @@ from torch import Tensor
 
 from gs2d.core.checks import check_shapes
 from gs2d.kernels.library import Library, ready_library
-from gs2d.kernels.loss_operations import LossOperations, NormalOptions, Vjp
+from gs2d.kernels.loss_operations import Kept, LossOperations, NormalOptions, Vjp
 
 
-def _for_expected(expected: float, gradients: Sequence[Tensor | None]) -> Vjp:
-    """Return a function that returns these gradients, multiplied if the cotangent is not ``expected``."""
+def _for_expected(expected: float) -> Vjp:
+    """Return a function that returns the kept gradients, multiplied if the cotangent is not ``expected``."""
 
-    def vjp(images: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor | None]:
+    def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], cotangent: Tensor) -> Kept:
         if torch.equal(cotangent, torch.tensor(expected, dtype=torch.float64).to(cotangent.dtype)):
-            return gradients
-        return [None if gradient is None else gradient * (cotangent / expected) for gradient in gradients]
+            return kept
+        return [None if gradient is None else gradient * (cotangent / expected) for gradient in kept]
 
     return vjp
 
@@ -55,30 +55,30 @@ class NativeLosses(LossOperations):
 
     def _photometric(
         self, *images: Tensor | None, expected: tuple[float, float, float], wanted: bool
-    ) -> tuple[tuple[Tensor, Tensor, Tensor], Vjp]:
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Kept, Vjp]:
         def compare(images: Sequence[Any], cotangents: Sequence[float], gradient: Tensor | None) -> Tensor:
             values = torch.empty(3, dtype=torch.float64)
             height, width = images[0].shape[:2]
             self._call("gs2d_photometric", *images, height, width, *cotangents, gradient, values)
             return values.to(images[0].dtype)
 
-        def vjp(images: Sequence[Any], needed: Sequence[bool], *given: Tensor | None) -> Sequence[Tensor | None]:
+        def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], *given: Tensor | None) -> Kept:
             cotangents = torch.stack([rounded.new_zeros(()) if one is None else one for one in given])
             if torch.equal(cotangents, rounded):
-                return (first,)
+                return kept
             gradient = torch.empty_like(images[0])
             compare(images, cotangents.tolist(), gradient)
             return (gradient,)
 
         rendered: Any = images[0]
-        first = torch.empty_like(rendered) if wanted else None
-        values = compare(images, expected, first)
+        gradient = torch.empty_like(rendered) if wanted else None
+        values = compare(images, expected, gradient)
         rounded = torch.tensor(expected, dtype=torch.float64).to(rendered.dtype)  # like the cotangents
-        return (values[0], values[1], values[2]), vjp
+        return (values[0], values[1], values[2]), [gradient], vjp
 
     def _normal_consistency(
         self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, wanted: bool
-    ) -> tuple[Tensor, Vjp]:
+    ) -> tuple[Tensor, Kept, Vjp]:
         camera, expected = how.camera, expected if expected != 0 else 1.0
         gradients = [torch.empty_like(image) if wanted else None for image in (normal, depth)]
         gradients.append(torch.empty_like(alpha) if wanted and how.per_splat else None)
@@ -88,23 +88,23 @@ class NativeLosses(LossOperations):
         inputs = (normal, depth, alpha, how.mask, how.weights, intrinsics, rotation)
         sizes = (camera.height, camera.width, int(how.per_splat), int(how.at_camera), expected)
         self._call("gs2d_normal_consistency", *inputs, *sizes, *gradients, value)
-        return value[0].to(normal.dtype), _for_expected(expected, gradients)
+        return value[0].to(normal.dtype), gradients, _for_expected(expected)
 
-    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Vjp]:
+    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Kept, Vjp]:
         normal: Any = images[0]
         gradient, expected = torch.empty_like(normal) if wanted else None, expected if expected != 0 else 1.0
         value = torch.empty(1, dtype=torch.float64)
         self._call("gs2d_normal_smoothness", *images, *normal.shape[:2], expected, gradient, value)
-        return value[0].to(normal.dtype), _for_expected(expected, [gradient])
+        return value[0].to(normal.dtype), [gradient], _for_expected(expected)
 
-    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Vjp]:
+    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Kept, Vjp]:
         mean = torch.empty(1, dtype=torch.float64)
         self._call("gs2d_masked_mean", values, mask, *values.shape, mean)
 
-        def vjp(tensors: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor]:
+        def vjp(tensors: Sequence[Any], kept: Kept, needed: Sequence[bool], cotangent: Tensor) -> Kept:
             values, mask = tensors
             if mask is None:
                 return ((cotangent / max(values.numel(), 1)).expand_as(values),)
             return (mask.to(cotangent.dtype) * (cotangent / max(int(mask.sum()), 1)),)
 
-        return mean[0].to(values.dtype), vjp
+        return mean[0].to(values.dtype), (), vjp

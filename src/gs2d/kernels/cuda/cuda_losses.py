@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.kernel_arguments import THREADS, arguments_of
-from gs2d.kernels.loss_operations import LossOperations, NormalOptions, Vjp
+from gs2d.kernels.loss_operations import Kept, LossOperations, NormalOptions, Vjp
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
@@ -76,46 +76,49 @@ class CudaLosses(LossOperations):
 
     def _photometric(
         self, *images: Tensor | None, expected: tuple[float, float, float], wanted: bool
-    ) -> tuple[tuple[Tensor, Tensor, Tensor], Vjp]:
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Kept, Vjp]:
         rendered: Any = images[0]
         height, width = rendered.shape[:2]
         blocks = strips(height, width)
         partials = rendered.new_empty(4, blocks)
-        given = {"maps": rendered.new_empty(3, height, width, 3) if wanted else None, "height": height, "width": width}
-        compared = ("rendered", "target", "mask")
-        self._launch("photometric_forward", blocks, given, dict(zip(compared, images, strict=False)), partials=partials)
+        maps = rendered.new_empty(3, height, width, 3) if wanted else None
+        given, size = (
+            dict(zip(("rendered", "target", "mask"), images, strict=False)),
+            {"height": height, "width": width},
+        )
+        self._launch("photometric_forward", blocks, given, size, maps=maps, partials=partials)
         means = self._finish(partials)
 
-        def vjp(images: Sequence[Any], needed: Sequence[bool], *cotangents: Tensor | None) -> Sequence[Tensor]:
-            gradient = torch.empty_like(images[0])
-            found = dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, cotangents), strict=True))
-            found |= dict(zip(compared, images, strict=False)) | {"means": means, "gradient": gradient}
-            self._launch("photometric_vjp", blocks, given, found)
+        def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], *cotangents: Tensor | None) -> Kept:
+            gradient, (maps, means) = torch.empty_like(images[0]), kept
+            found = dict(zip(("rendered", "target", "mask"), images, strict=False))
+            found |= dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, cotangents), strict=True))
+            self._launch("photometric_vjp", blocks, size, found, maps=maps, means=means, gradient=gradient)
             return (gradient,)
 
-        return (means[1].clone(), means[2].clone(), means[3].clone()), vjp
+        return (means[1].clone(), means[2].clone(), means[3].clone()), (maps, means), vjp
 
     def _normal_consistency(
         self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, wanted: bool
-    ) -> tuple[Tensor, Vjp]:
+    ) -> tuple[Tensor, Kept, Vjp]:
         blocks, given = -(-depth.numel() // MEAN_PIXELS), _normal_inputs(how)
         partials = depth.new_empty(2, blocks)
         self._launch("normal_consistency", blocks, given, normal=normal, depth=depth, alpha=alpha, partials=partials)
         means = self._finish(partials, complement=not how.per_splat and how.weights is None)
 
-        def vjp(images: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor | None]:
+        def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], cotangent: Tensor) -> Kept:
             want = [*needed[:2], needed[2] and how.per_splat]
             gradients = [torch.empty_like(x) if w else None for x, w in zip(images, want, strict=True)]
             tiles = -(-how.camera.width // NORMAL_W) * -(-how.camera.height // NORMAL_H)
             inputs = dict(zip(("normal", "depth", "alpha"), images, strict=True))
             outputs = dict(zip(("g_normal", "g_depth", "g_alpha"), gradients, strict=True))
-            outputs |= {"means": means, "cotangent": _cotangent(cotangent)}
+            outputs |= {"means": kept[0], "cotangent": _cotangent(cotangent)}
             self._launch("normal_consistency_vjp", tiles, given, inputs, outputs)
             return gradients
 
-        return means[1].clone(), vjp
+        return means[1].clone(), [means], vjp
 
-    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Vjp]:
+    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Kept, Vjp]:
         normal: Any = images[0]
         height, width = normal.shape[:2]
         blocks, size = -(-height * width // MEAN_PIXELS), {"height": height, "width": width}
@@ -123,15 +126,15 @@ class CudaLosses(LossOperations):
         self._launch("normal_smoothness", blocks, size, dict(zip(names, images, strict=True)), partials=partials)
         means = self._finish(partials)
 
-        def vjp(images: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor]:
+        def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], cotangent: Tensor) -> Kept:
             gradient = torch.empty_like(images[0])
-            found = {"means": means, "cotangent": _cotangent(cotangent), "g_normal": gradient}
+            found = {"means": kept[0], "cotangent": _cotangent(cotangent), "g_normal": gradient}
             self._launch("normal_smoothness", blocks, size, dict(zip(names, images, strict=True)), found)
             return (gradient,)
 
-        return means[1].clone(), vjp
+        return means[1].clone(), [means], vjp
 
-    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Vjp]:
+    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Kept, Vjp]:
         blocks = -(-values.numel() // MEAN_PIXELS)
         partials = values.new_empty(2, blocks)
         height, width = values.shape
@@ -139,9 +142,9 @@ class CudaLosses(LossOperations):
         self._launch("masked_mean", blocks, given, height=height, width=width)
         means = self._finish(partials)
 
-        def vjp(tensors: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Sequence[Tensor]:
-            values, mask = tensors
+        def vjp(tensors: Sequence[Any], kept: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Kept:
+            (values, mask), (means,) = tensors, kept
             each = cotangent * means[0]
             return (each.expand_as(values) if mask is None else mask * each,)
 
-        return means[1].clone(), vjp
+        return means[1].clone(), [means], vjp
