@@ -189,20 +189,3 @@ def logit(opacities: np.ndarray) -> np.ndarray:
     """Return the logits, float32, of opacities; 0 and 1 are moved inside, because their logits are infinite."""
     o = np.clip(opacities.astype(np.float64), 1e-30, 1.0 - 2.0**-25)
     return np.asarray(np.log(o) - np.log1p(-o)).astype(np.float32)
-
-
-def log_scales_of(scales: np.ndarray) -> np.ndarray:
-    """Return the logarithms, float32, of scales >= 0; -80 for 0, NaN for NaN."""
-    with np.errstate(divide="ignore"):
-        return np.maximum(np.log(scales.astype(np.float64)), NO_SCALE).astype(np.float32)
-
-
-def logit_of_byte(alpha: np.ndarray) -> np.ndarray:
-    """Return the logits, float32, of 8-bit opacities; 0 and 255 are moved inside by half a step."""
-    o = np.clip(alpha.astype(np.float64) / 255.0, 0.5 / 255.0, 254.5 / 255.0)
-    return np.asarray(np.log(o / (1.0 - o))).astype(np.float32)
-
-
-def to_byte(x: np.ndarray) -> np.ndarray:
-    """Round to the nearest integer in 0 to 255."""
-    return np.asarray(np.clip(np.floor(x + 0.5), 0, 255)).astype(np.uint8)

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image
 
-from gs2d.core.atomic_files import atomic_write, disk_error
+from gs2d.core.atomic_files import atomic_write
 from gs2d.data.exif import DAMAGED_EXIF
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size, open_image, read_image, read_mask, write_image
 from gs2d.data.masks import FOLDER, Masks, find_masks, find_masks_in
 from gs2d.errors import DataError
+from gs2d.io.run_dir import make_folder
 from gs2d.sfm.photos import JPEG, Photo, turn
 
 QUALITY = 95  # of re-encoded JPEG files, without chroma subsampling
@@ -32,10 +33,7 @@ def copy_images(
     links for unchanged images; they are copied if the folder is on another disk.
     """
     for parent in sorted({(folder / photo.name).parent for photo in photos}):
-        try:
-            parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise disk_error(parent, error) from error
+        make_folder(parent)
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(lambda photo: _stage(photo, folder / photo.name, max_size, link), photos)
 
@@ -130,10 +128,7 @@ def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Pa
         if target.exists():  # from an interrupted search
             count, kept = count + 1, True
             continue
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise disk_error(target.parent, error) from error
+        make_folder(target.parent)
         mask = _resized(_upright(photo, path), photo.size_within(max_size))
         write_image(target, mask)
         count, kept = count + 1, kept or bool(mask.any())

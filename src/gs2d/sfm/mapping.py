@@ -48,14 +48,6 @@ class Steps:
         shutil.rmtree(whole, ignore_errors=True)
         os.rename(part, whole)
 
-    def names(self, prefix: str) -> list[str]:
-        """Return the names of all models that start with ``prefix``."""
-        return sorted(path.name for path in self.folder.glob(f"{prefix}*") if path.is_dir())
-
-    def remove(self, name: str) -> None:
-        """Remove a model."""
-        shutil.rmtree(self.folder / name, ignore_errors=True)
-
     def read(self, pycolmap: Any, name: str) -> Any:
         """Read a model. Every step reads its input from disk, so an interruption does not change the result."""
         return pycolmap.Reconstruction(str(self.folder / name))
@@ -138,8 +130,8 @@ def map_globally(pycolmap: Any, request: dict[str, Any], steps: Steps, name: str
 
 def _write(steps: Steps, name: str, models: list[Any]) -> list[str]:
     """Write models, in place of those of an interrupted attempt; returns their names."""
-    for earlier in steps.names(f"{name}-"):
-        steps.remove(earlier)
+    for earlier in steps.folder.glob(f"{name}-*"):
+        shutil.rmtree(earlier, ignore_errors=True)
     names = [f"{name}-{i}" for i in range(len(models))]
     for written, model in zip(names, models, strict=True):
         steps.write(written, model)

@@ -14,13 +14,14 @@ from gs2d.contrib.demo.demo_scene import ToyScene, build_scene
 from gs2d.contrib.demo.shading import BakedLight, bake, shade
 from gs2d.contrib.demo.shapes import merge_vertices
 from gs2d.contrib.demo.textures import linear_to_srgb
-from gs2d.core.atomic_files import atomic_write, disk_error
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
 from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
 from gs2d.io.meshes import write_mesh
+from gs2d.io.run_dir import make_folder
 from gs2d.meshing.raycast import cast_camera
 
 CAMERA_ANGLE_X = 0.6911112  # radians, the horizontal field of view of NeRF-Synthetic
@@ -107,10 +108,7 @@ def _write_cameras(root: Path, cameras: Mapping[str, Sequence[Camera]]) -> None:
 
 def _make_folders(root: Path, splits: tuple[str, ...]) -> None:
     for split in splits:
-        try:
-            (root / split).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise disk_error(root / split, error) from error
+        make_folder(root / split)
     (root / "transforms_train.json").unlink(missing_ok=True)
 
 

@@ -10,12 +10,13 @@ import os
 
 import numpy as np
 
+from gs2d.contrib.formats.quantised import log_scales_of, logit_of_byte, to_byte
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import read_bytes
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, log_scales_of, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, Tell, sigmoid, unit_quats
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 

@@ -14,10 +14,11 @@ import warnings
 
 import numpy as np
 
+from gs2d.contrib.formats.quantised import logit_of_byte, morton_order, to_byte
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, sigmoid, unit_quats
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 from gs2d.io.splat_ply import DISKS_COMMENT
 
@@ -65,21 +66,6 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
     write_ply(path, elements, comments=("written by gs2d", DISKS_COMMENT))
     steep = int((np.abs(g.shN) > 4.0).any(axis=(1, 2)).sum()) if g.shN.size else 0
     return (f"{steep} of {n} splats have SH coefficients beyond 4, the limit of the format",) if steep else ()
-
-
-def morton_order(means: np.ndarray) -> np.ndarray:
-    """Return the Morton order of points, in which neighbours in the list are near in space."""
-    if not len(means):
-        return np.zeros(0, dtype=int)
-    if np.abs(means).max() > 1e38:  # the span may exceed float32
-        means = means.astype(np.float64)
-    low, high = means.min(axis=0), means.max(axis=0)
-    cell = ((means - low) / np.maximum(high - low, 1e-30) * ((1 << 21) - 1)).astype(np.uint64)
-    code = np.zeros(len(means), np.uint64)
-    for bit in range(21):
-        for axis in range(3):
-            code |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
 
 
 def _fractions(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

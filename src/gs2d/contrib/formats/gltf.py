@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 
 from gs2d.contrib.formats.gltf_document import GltfDocument, node_matrices, read_document
+from gs2d.contrib.formats.quantised import log_scales_of, to_byte
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, log_scales_of, logit, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit, sigmoid, unit_quats
 from gs2d.io.meshes import LINEAR_U16
 
 EXTENSION = "KHR_gaussian_splatting"

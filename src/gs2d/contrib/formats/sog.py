@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gs2d.contrib.formats.compressed_ply import morton_order
+from gs2d.contrib.formats.quantised import logit_of_byte, morton_order, to_byte
 from gs2d.contrib.formats.sog_palette import codebook, nearest_code, palette
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_entries, check_growth
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, sigmoid, unit_quats
 
 _ROW = 64  # palette rows per image row
 _LONGEST = 16 << 20  # bytes of a JSON file

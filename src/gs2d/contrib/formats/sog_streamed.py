@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gs2d.contrib.formats.compressed_ply import morton_order
 from gs2d.contrib.formats.levels import halved
+from gs2d.contrib.formats.quantised import morton_order
 from gs2d.contrib.formats.sog import packed_sog
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.camera import look_at

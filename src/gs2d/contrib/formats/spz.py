@@ -22,23 +22,14 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.contrib.formats.quantised import logit_of_byte, to_byte
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import required
 from gs2d.core.growth import check_growth
 from gs2d.core.json_files import read_bytes
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import (
-    THIN,
-    Gaussians,
-    Tell,
-    drawn_bands,
-    logit_of_byte,
-    sigmoid,
-    to_byte,
-    unit_quats,
-    with_thickness,
-)
+from gs2d.io.gaussians import THIN, Gaussians, Tell, drawn_bands, sigmoid, unit_quats, with_thickness
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")

@@ -22,20 +22,12 @@ from typing import Any
 import numpy as np
 
 from gs2d.contrib.formats import usd_process
+from gs2d.contrib.formats.quantised import log_scales_of
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.extras import install
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import (
-    Gaussians,
-    Tell,
-    drawn_bands,
-    log_scales_of,
-    logit,
-    sigmoid,
-    unit_quats,
-    with_thickness,
-)
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit, sigmoid, unit_quats, with_thickness
 
 ENDINGS = (".usd", ".usdc", ".usda", ".usdz")
 _APIS = (
