@@ -19,6 +19,7 @@ import gs2d
 PACKAGE = Path(gs2d.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 MAX_LINES = 700  # soft: a file is one thing that a reader looks for
+MAX_PARAMETERS = 8
 
 # Floors: a module imports from its own room or from a lower floor. Rooms of one floor do not import each other.
 FLOORS = {
@@ -239,6 +240,30 @@ def test_only_render_distinguishes_backends() -> None:
 def test_files_are_not_too_long() -> None:
     lines = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in MODULES.items()}
     assert not {module: count for module, count in lines.items() if count > MAX_LINES}
+
+
+def test_no_function_takes_more_than_eight_parameters() -> None:
+    """Besides self and cls; ``*args`` and ``**kwargs`` count as one each."""
+
+    def takes(node: ast.AST) -> int:
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            return 0
+        a = node.args
+        named = [arg.arg for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs)]
+        return len(named) - (named[:1] in (["self"], ["cls"])) + (a.vararg is not None) + (a.kwarg is not None)
+
+    assert lines_where(lambda node: takes(node) == MAX_PARAMETERS, MODULES)
+    assert not lines_where(lambda node: takes(node) > MAX_PARAMETERS, MODULES)
+
+
+def test_names_of_modules_and_classes_are_unique() -> None:
+    classes = [(node.name, name) for name in MODULES for node in nodes_of(name) if isinstance(node, ast.ClassDef)]
+    files = [(path.stem, name) for name, path in MODULES.items() if path.name != "__init__.py"]
+    for kind in (classes, files):
+        homes: dict[str, list[str]] = {}
+        for name, module in kind:
+            homes.setdefault(name, []).append(module)
+        assert not {name: modules for name, modules in homes.items() if len(modules) > 1}
 
 
 def lines_where(is_wrong: Callable[[ast.AST], bool], modules: Iterable[str]) -> list[str]:

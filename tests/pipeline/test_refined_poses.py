@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from ball_runs import SMALL, Stop, comparable, options
+from gs2d.config.quantities import QUANTITIES
 from gs2d.core.transforms import perturb_pose
 from gs2d.data import load_scene
 from gs2d.errors import RunError
@@ -26,6 +27,7 @@ from gs2d.pipeline.prepare.loaded import open_finished, reload_run
 from gs2d.pipeline.prepare.options import EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, Step, ignore
+from gs2d.training.learned.camera_pose import CameraPose
 
 EARLY = (*SMALL, "learned.poses.start=5", "learned.poses.rate=0.01")  # so that 60 iterations show something
 
@@ -82,6 +84,18 @@ def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, t
     texture = _views(job, TextureOptions(texture_downscale=2), ignore, 1)
     assert np.array_equal(texture[0].camera.T_cam_world, job.scene.train[0].camera.T_cam_world)
     assert texture[0].camera.width == job.scene.train[0].camera.width // 2
+
+
+def test_a_quantity_of_a_package_may_move_cameras(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(QUANTITIES._things, "guest", CameraPose)
+    early = (*SMALL, "learned.guest.start=5", "learned.guest.rate=0.01")
+    made = train(options(capture, tmp_path / "run", learn="guest", overrides=early), ignore)
+    _, job = open_finished(made.path, 1, ignore)
+    for view, before in zip(job.scene.train, load_scene(capture).train, strict=True):
+        assert not np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
+    assert evaluate_run(made.path)["train"]["psnr"] == made.metrics()["stages"][-1]["train"]["psnr"]
 
 
 def test_aligned_scores_are_added_on_request(run: RunFolder) -> None:

@@ -126,7 +126,7 @@ def evaluate(
 ) -> ImageMetrics:
     """Return the mean PSNR, SSIM and LPIPS of views, as ``gs2d evaluate`` measures them.
 
-    Surfaces are scored by :func:`gs2d.evaluation.surface.evaluate_surface`.
+    Surfaces are scored by :func:`gs2d.contrib.lab.surface_score.evaluate_surface`.
 
     Parameters
     ----------

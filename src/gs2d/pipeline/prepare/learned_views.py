@@ -56,8 +56,9 @@ def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Sce
 
     Raises RunError if the file is missing, damaged or of other photographs.
     """
-    names = recipe.quantities.keys() - {"poses", "intrinsics"}
-    if not names or not (run.file(LEARNED).exists() or run.file(SPLATS).exists()):
+    installed = (name for name in recipe.quantities if name in QUANTITIES)
+    names = {name for name in installed if QUANTITIES.get(name).changes_color}
+    if not run.file(LEARNED).exists() and not (names and run.file(SPLATS).exists()):
         return scene
     remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
     try:
@@ -66,7 +67,7 @@ def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Sce
     except (DataError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise RunError(f"{run.file(LEARNED)} does not hold the appearance of this run ({error}); {remedy}") from error
     for view in scene.train:
-        missing = (names & set(QUANTITIES.builtin)) - found.get(view.name, {}).keys()
+        missing = names - found.get(view.name, {}).keys()
         if missing:
             raise RunError(f"{run.file(LEARNED)} lacks the {min(missing)} of {view.name}; {remedy}")
     return scene.with_appearance(found)
@@ -110,8 +111,8 @@ def over(view: View, color: Tensor, background: tuple[float, float, float]) -> t
 
 # -- cameras -----------------------------------------------------------------------------------------------------------
 def write_poses(run: RunFolder, recipe: Recipe, scene: Scene, refined: Scene, on_event: OnEvent) -> None:
-    """Write ``poses.json`` if the recipe moves training cameras, and report how far from those of the capture."""
-    if not recipe.moves_cameras:
+    """Write ``poses.json`` if the recipe or a quantity of a package moves training cameras, and report how far."""
+    if not (recipe.moves_cameras or _differ(scene, refined)):
         return
     focus = focus_point([view.camera for view in scene.train])
     frames, far = [], []
@@ -136,6 +137,14 @@ def write_poses(run: RunFolder, recipe: Recipe, scene: Scene, refined: Scene, on
         moved = max(max(abs(zoom.right), abs(zoom.down)) for zoom in zooms)
         also = f", principal points moved by up to {moved:.4f} focal lengths" if moved else ""
         on_event(Notice(f"refined focal lengths are {scales[0]:.4f}{several} times those of the capture{also}"))
+
+
+def _differ(scene: Scene, refined: Scene) -> bool:
+    """Return whether a training view has another pose or zoom."""
+    return any(
+        old.zoom != new.zoom or not np.array_equal(old.camera.T_cam_world, new.camera.T_cam_world)
+        for old, new in zip(scene.train, refined.train, strict=True)
+    )
 
 
 def _frame(view: View, root: Path | None) -> dict[str, Any]:
@@ -179,7 +188,7 @@ def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
 
     Raises RunError if the file is missing, damaged or of other photographs.
     """
-    if not recipe.moves_cameras or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
+    if not run.file(POSES).exists() and not (recipe.moves_cameras and run.file(SPLATS).exists()):
         return scene
     remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
     try:

@@ -105,8 +105,8 @@ class CommonTraining(Options):
     robust: Robust = "auto"
     """Robust training for real captures: dense start, removal of floaters. auto: except for known data sets."""
     learn: Annotated[str | tuple[str, ...], Arg(metavar="NAMES")] = "auto"
-    """Learn also exposure, poses or intrinsics, separated by commas; none; or auto: exposure if photographs differ, in
-    robust training. auto,poses adds poses to that."""
+    """Learn also exposure, poses, intrinsics or quantities of packages, separated by commas; none; or auto: exposure if
+    photographs differ, in robust training. auto,poses adds poses to that."""
     test_every: int | None = None
     """Hold out every N-th view (sorted by name) for testing; 0 trains on all (default: 8, or by
     protocol; 0 for captures of `gs2d poses` with fewer than 24 photographs)."""
@@ -133,7 +133,7 @@ class CommonTraining(Options):
         """Return the names in ``learn``, checked. "none" is (); "auto" is exposure if the photographs differ."""
         names = tuple(self.learn.split(",")) if isinstance(self.learn, str) else self.learn
         for name in names if names != ("none",) else ():
-            if name not in ("auto", *QUANTITIES.builtin):
+            if name != "auto" and name not in QUANTITIES:
                 raise RecipeError(f"--learn: {QUANTITIES.unknown(name, also=('auto', 'none'))}")
         return names if names != ("none",) else ()
 

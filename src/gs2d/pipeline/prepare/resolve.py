@@ -16,6 +16,7 @@ from gs2d.config.presets import (
     with_robustness,
 )
 from gs2d.config.protocols import BLACK, Protocol, get_protocol
+from gs2d.config.quantities import Quantity
 from gs2d.config.recipe import FEW_VIEWS, Recipe, validate
 from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides
@@ -60,6 +61,9 @@ def build_recipe(
     learned = training.learned
     value = with_poses(value) if "poses" in learned else value
     value = with_intrinsics(value) if "intrinsics" in learned else value
+    for name in learned:  # of packages; exposure is decided above
+        if name not in ("auto", "exposure") and not value.learns(name):
+            value = replace(value.with_learned(Quantity(name)), name=f"{value.name}-{name}")
     value = with_depth_prior(value, training.depth_prior) if training.depth_prior is not None else value
     value = with_normal_prior(value) if training.normal_prior else value
     value = with_robustness(value) if robust else value
