@@ -370,10 +370,7 @@ def facade(rng: np.random.Generator, size: int) -> Design:
         Part(things.sheet((-4.5, -1.5, 0), (9, 0, 0), (0, 1.5, 0), 0.15), paving),
         Part(things.sheet((-4.5, -12, 0), (9, 0, 0), (0, 10.5, 0), 0.3), paving, "support"),
         *[Part(things.sheet((s, -12, 0), (12, 0, 0), (0, 16, 0), 0.6), paving, "support") for s in (-16.5, 4.5)],
-        *[
-            Part(things.block((s, 0.6, 0), (s + 6, 5, h), 0.6), house, "support")
-            for s, h in ((-10.8, 5.0), (4.9, 4.2))
-        ],
+        *[Part(things.block((s, 0.6, 0), (s + 6, 5, h), 0.6), house, "support") for s, h in ((-10.8, 5.0), (4.9, 4.2))],
     ]
     people = [things.person(rng) for _ in range(7)]
 
