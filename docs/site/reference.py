@@ -28,7 +28,7 @@ def commands() -> str:
     lines += ["## Options of several commands", ""]
     for group in sorted(shared, key=lambda group: -len(owners[group])):
         used = ", ".join(f"[`{name}`](#gs2d-{name})" for name in owners[group])
-        lines += [f"### {_heading(group)}", "", f"Of {used}.", ""]
+        lines += [f"### {_heading(group)}", "", f"Options of {used}.", ""]
         options = {option.field: option for name in owners[group] for option in options_of(NAMES[name])}
         lines += _explained([option for option in options.values() if option.owner is group])
     return "\n".join(lines)

@@ -215,7 +215,7 @@ def test_every_nth_view_is_a_test_view(tmp_path: Path, every: int, test: int) ->
 
 
 def test_test_every_is_an_error_for_a_capture_with_a_split(capture: Path, tmp_path: Path) -> None:
-    with pytest.raises(ProtocolError, match="--test-every: .* has a split of its own; leave the option out"):
+    with pytest.raises(ProtocolError, match="--test-every: .* has its own test views; omit the option"):
         prepare_run(options(capture, tmp_path / "run", test_every=4), ignore)
 
 
@@ -234,7 +234,7 @@ def test_a_reader_of_a_package_can_define_the_split(
     job = prepare_run(chosen, ignore)
     assert {view.name.split("/")[0] for view in job.scene.test} == {"test"}
     assert job.scene.own_split
-    with pytest.raises(ProtocolError, match="--test-every: .* has a split of its own; leave the option out"):
+    with pytest.raises(ProtocolError, match="--test-every: .* has its own test views; omit the option"):
         prepare_run(replace(chosen, test_every=4), ignore)
 
 

@@ -174,13 +174,13 @@ def _classes(module: str) -> dict[str, ast.ClassDef]:
 
 # -- help --------------------------------------------------------------------------------------------------------------
 _SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."
-_OWN = "Of this command"
+_OWN = "More options"
 WIDEST = 100  # columns of help; longer lines are hard to read
 TITLES = {  # headings of shared options, in order
     PoseEstimation: "Cameras of photographs",
     CommonTraining: "Training",
-    Training: "Training",
-    HowItRuns: "How it runs",
+    Training: "Viewer and cache",
+    HowItRuns: "Execution",
     Common: "Output",
 }
 

@@ -125,7 +125,7 @@ class MeshCommand(TextureOptions, MeshOptions, Resources, Common):
 
     run: Annotated[Path | None, Arg(metavar="RUN", positional=True)] = None
     """Run folder."""
-    out: Path | None = None
+    out: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Mesh file (default: mesh.ply in the run, or mesh.glb with --texture)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Mesh the splats of this file instead of a run. Needs --out."""
@@ -145,7 +145,7 @@ class RenderCommand(RenderOptions, Resources, Common):
 
     run: RunPath
     """Run folder."""
-    out: Path | None = None
+    out: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of the images (default: renders/SPLIT or renders/orbit in the run)."""
     threads: int | None = None
     """CPU threads."""
@@ -184,7 +184,7 @@ class ExportCommand(Common):
     """File to write. Its ending selects the format (default: scene.html in the run, with --format html)."""
     format: str | None = None
     """Format: html (a page that works offline in any browser), 2dgs (of the 2DGS paper), 3dgs (opens in common
-    viewers), compressed, spz, spz4, splat, usd, gltf, sog, streamed, or one of a package (default: by the ending of
+    viewers), compressed, spz, spz4, splat, usd, gltf, sog, streamed, or one from a package (default: by the ending of
     --out; .ply is 3dgs)."""
 
 

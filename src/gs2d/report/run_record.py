@@ -76,7 +76,7 @@ def reading(path: Path) -> Iterator[None]:
     except DataError:
         raise
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError, UndefinedError) as error:
-        raise DataError(f"{path} is damaged: {error!r}; the gs2d command that wrote it writes it again") from error
+        raise DataError(f"{path} is damaged: {error!r}; repeat the gs2d command that wrote it") from error
 
 
 def name_of(value: Any) -> str:

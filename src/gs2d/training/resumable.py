@@ -22,7 +22,7 @@ def check_resumable(state: TrainState, recipe: Recipe, scene: Scene) -> None:
     last, views = max(state.queue, default=0), len(scene.train)
     if last >= views:
         raise RunError(
-            f"the checkpoint refers to training view {last}, but the scene has {views}; is it of another scene?"
+            f"the checkpoint refers to training view {last}, but the scene has {views}; is it from another scene?"
         )
     if state.shine is not None and len(state.shine) != views:
         raise RunError(

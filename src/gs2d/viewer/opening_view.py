@@ -31,7 +31,7 @@ class PhotographedArc:
 
 
 def guessed_subject(cameras: Sequence[Camera], center: np.ndarray, unit: float, up: np.ndarray) -> Subject:
-    """Return a subject for a capture of which only the cameras are known.
+    """Return the subject of a capture, guessed from its cameras alone.
 
     ``center`` [3] world units: the point that the cameras look at. ``unit`` (world units): typical distance between the
     cameras and ``center``. ``up`` [3]: unit vector.

@@ -82,7 +82,7 @@ def whole(value: Any, where: str) -> int:
 def entries(value: Any, where: str) -> Mapping[str, Any]:
     """Return a JSON object, or raise DataError."""
     if not isinstance(value, dict):
-        raise DataError(f"{where} must be an object, got {type(value).__name__}; is the file of another tool?")
+        raise DataError(f"{where} must be an object, got {type(value).__name__}; was it written by another program?")
     return value
 
 

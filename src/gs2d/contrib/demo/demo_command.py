@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from gs2d.cli.commands import BEGIN, Common, register_command
-from gs2d.config.arguments import PYTHON_ONLY, SETTING
+from gs2d.config.arguments import PYTHON_ONLY, SETTING, Arg
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.recipe import Recipe
 from gs2d.pipeline.prepare.options import HowItRuns, ViewerOption
@@ -17,7 +17,7 @@ from gs2d.pipeline.prepare.options import HowItRuns, ViewerOption
 class DemoOptions(HowItRuns):
     """Options of the demo."""
 
-    out: Path = Path("runs/demo")
+    out: Annotated[Path, Arg(metavar="RUN")] = Path("runs/demo")
     """Run folder; an earlier demo there is replaced."""
     recipe: str | Recipe = DEFAULT_RECIPE
     """Recipe. `gs2d recipes` lists them."""
@@ -26,7 +26,7 @@ class DemoOptions(HowItRuns):
     page: Annotated[bool, SETTING] = True
     """Whether to write scene.html, the splats as a page for any browser."""
     viewer: ViewerOption = None
-    """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
+    """Show the training in the browser while it runs, at this port (default: the first free one from 8080)."""
     train_views: Annotated[int, PYTHON_ONLY] = 40
     test_views: Annotated[int, PYTHON_ONLY] = 8
     size: Annotated[int, PYTHON_ONLY] = 256

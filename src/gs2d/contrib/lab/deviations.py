@@ -106,7 +106,7 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
 
 
 def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
-    """Yield scenes whose protocol has another weight of distortion than the paper's "100/10"."""
+    """Yield scenes whose protocol sets a distortion weight other than the paper's "100/10"."""
     if not any("100/10" in row.name for row in table.rows):
         return
     weighed = [(s.name, s.protocol.loss_weights["distortion"]) for s in scenes if s.data_set != TNT]

@@ -106,7 +106,7 @@ class BlocksOptions(CommonTraining, Resources):
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
     format: str = "auto"
-    """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one of a package."""
+    """Capture format: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one from a package."""
     downscale: int = 1
     """Shrink the photographs by this integer factor."""
     schedule_scale: float = 1.0

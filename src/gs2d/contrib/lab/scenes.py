@@ -57,7 +57,7 @@ def find_scenes(
             f"--data must be a folder of captures, got {'a file' if data.exists() else 'nothing'} at {data}"
         )
     if truths is not None and not truths.is_dir():
-        raise DataError(f"--ground-truth must be a folder of true surfaces, found none at {truths}")
+        raise DataError(f"--ground-truth must be a folder with ground truths, got none at {truths}")
     captures = dict(sorted(_captures(data, DEPTH).items()))
     broken = unreadable(data)
     if not captures:

@@ -68,7 +68,7 @@ def read_control(path: Path) -> ControlPoints:
 def _add(
     table: Table, line: int, row: Mapping[str, str], world: tuple[str, ...], points: dict[str, ControlPoint]
 ) -> None:
-    """Add a row: a mark of a point, or its position in the run."""
+    """Add a row: a control point in an image, or its position in the run."""
     where = f"{table.path}, line {line}"
     place = np.array([table.number(line, row, column) for column in world])
     name = row.get("name", "").strip() or "point at " + " ".join(f"{value:.10g}" for value in place)

@@ -42,7 +42,7 @@ def _show_export(written: dict[str, Any], console: Console) -> None:
         console.say(note)
     offset = " ".join(f"{value:.10g}" for value in written["offset"])
     console.say(f"{written['file']}: metres in {written['frame']}, relative to the offset {offset}")
-    console.say(f"beside it: {', '.join(written['beside'])}")
+    console.say(f"also written: {', '.join(written['beside'])}")
 
 
 def _show_orthophoto(written: dict[str, Any], console: Console) -> None:

@@ -46,7 +46,7 @@ MAX_POINTS = 2000  # sparse points per camera
 
 
 def subject_in(trained: Trained, box: Sequence[float] | None = None) -> Subject:
-    """Return the subject of a scene: ``box`` (x0 y0 z0 x1 y1 z1, world units), else the one that is found.
+    """Return the subject of a scene: ``box`` (x0 y0 z0 x1 y1 z1, world units), or a detected one.
 
     Raises ProtocolError if the box is invalid, or the splats show no surface, RunError if there is no splat in the box.
     """

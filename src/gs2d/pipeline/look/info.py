@@ -43,7 +43,7 @@ def describe_file(path: Path) -> dict[str, Any]:
     """Describe a file of splats, a mesh or points. Raises DataError if the file is none of these, or is broken."""
     if path.suffix.lower() not in _OF_MODELS and not is_splat_file(path):
         remedy = suggestion(path, "run" if belongs_to_run(path) else "capture")
-        raise DataError(f"{path} is no file of splats, mesh or points{remedy}")
+        raise DataError(f"{path} is not a file of splats, a mesh or points{remedy}")
     size = path.stat().st_size
     reader = reader_of(path)
     if reader is not None and reader.mesh is not None and (mesh := reader.mesh(path)) is not None:

@@ -107,7 +107,7 @@ def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
         on_event(Notice(f"{len(missing) - SHOWN_SKIPS} more files are missing; `gs2d info` lists them"))
     check_memory(scene, downscale, on_host=backend.on_host)
     if options.test_every is not None and scene.own_split:
-        raise ProtocolError(f"--test-every: {options.scene} has a split of its own; leave the option out")
+        raise ProtocolError(f"--test-every: {options.scene} has its own test views; omit the option")
     return OpenCapture(scene, with_masks(protocol, scene, on_event), backend, downscale, quality)
 
 

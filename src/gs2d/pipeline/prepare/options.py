@@ -96,7 +96,7 @@ class Effort(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class CommonTraining(Options):
-    """What is trained and how: options of every command that trains on photographs."""
+    """Options of every command that trains on photographs."""
 
     recipe: str | Recipe = DEFAULT_RECIPE
     """Recipe. `gs2d recipes` lists them."""
@@ -105,8 +105,8 @@ class CommonTraining(Options):
     robust: Robust = "auto"
     """Robust training for real captures: dense start, removal of floaters. auto: except for known data sets."""
     learn: Annotated[str | tuple[str, ...], Arg(metavar="NAMES")] = "auto"
-    """Learn also exposure, poses, intrinsics or quantities of packages, separated by commas; none; or auto: exposure if
-    photographs differ, in robust training. auto,poses adds poses to that."""
+    """Also learn exposure, poses, intrinsics or quantities of packages (separated by commas), or none. auto: exposure
+    if photographs differ, in robust training; auto,poses adds poses."""
     test_every: int | None = None
     """Hold out every N-th view (sorted by name) for testing; 0 trains on all (default: 8, or by
     protocol; 0 for captures of `gs2d poses` with fewer than 24 photographs)."""
@@ -145,7 +145,7 @@ class Training(CommonTraining):
     cache: Annotated[Path | None, Arg(metavar="DIR", setting=True)] = None
     """Folder that keeps finished stages for reuse by runs with the same scene and settings."""
     viewer: ViewerOption = None
-    """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
+    """Show the training in the browser while it runs, at this port (default: the first free one from 8080)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +189,7 @@ class TrainOptions(Training, Effort, Resources, HowItRuns):
     scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
     """Folder of a capture: COLMAP, Blender, nerfstudio, DTU, OpenSfM, OpenDroneMap, Metashape or Meshroom."""
     format: str = "auto"
-    """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one of a package."""
+    """Capture format: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one from a package."""
     masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
     init: Annotated[Path | None, Arg(metavar="FILE")] = None
