@@ -74,7 +74,7 @@ def _register_rows() -> None:
     add("2dgs-r-module-iii", "Module row III: II with opacity frozen", partial(two_dgs_r, stage_3=refine(nc=0.0)))
     for label, densify in {"d": ABSGS_DEFAULT, "a": ABSGS_ADJUSTED}.items():
         stage_3 = refine(freeze=(), densify=densify)
-        about = f"AbsGS-{label.upper()}: stage 3 densifies by absolute gradients instead of the clone; opacity free"
+        about = f"AbsGS-{label.upper()}: stage 3 uses absolute gradients, no clone; opacity free"
         add(f"2dgs-r-absgs-{label}", about, partial(two_dgs_r, stage_3=stage_3))
 
 

@@ -1,6 +1,6 @@
 """The verdict on a run: a grade, the measures behind it, and advice; ``verdict.json``.
 
-The grade is the worse of two measures: PSNR of test views (training views if there are none), and floaters. Missing
+The grade is the worst one of PSNR of test views (training views if there are none), floaters and surface. Missing
 measures are listed and do not change the grade.
 """
 
@@ -36,7 +36,7 @@ NAMED = 3  # views named in a sentence; verdict.json has all
 HEADLINES: Mapping[str | None, str] = {
     GOOD: "New views look like photographs of the scene.",
     USABLE: "The scene is recognisable but has visible flaws.",
-    POOR: "Parts of the scene are wrong or foggy.",
+    POOR: "Parts of the scene are wrong or blurred.",
     None: "Nothing was measured.",
 }
 UNCHECKED = "The training photographs are reproduced {}; new views were not checked."
