@@ -35,7 +35,7 @@ from gs2d.evaluation.image_metrics import image_metrics, psnr_float
 from gs2d.pipeline.prepare.learned_views import photographed
 from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.pipeline.prepare.options import Training
-from gs2d.pipeline.prepare.predicted_exposure import predicted
+from gs2d.pipeline.prepare.predicted_views import predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, robust_and_exposure, with_backdrop
 from gs2d.render.api import rasterize
 from gs2d.render.exposure_transform import fit_exposure

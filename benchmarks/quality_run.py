@@ -178,7 +178,7 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
     # Imported while the clocks are stopped: training does not need these modules.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.finish.scoring import score_views
-    from gs2d.pipeline.prepare.predicted_exposure import predicted
+    from gs2d.pipeline.prepare.predicted_views import predicted
 
     shown = predicted(job.trained(splats, learned))
     scores = score_views(shown, shown.scene.test or shown.scene.train, ignore)

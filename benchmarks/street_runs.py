@@ -36,7 +36,7 @@ from gs2d.pipeline.finish.run_subject import sights, surface_reach
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import Trained, open_finished
 from gs2d.pipeline.prepare.open_capture import FEW
-from gs2d.pipeline.prepare.predicted_exposure import predicted
+from gs2d.pipeline.prepare.predicted_views import predicted
 from gs2d.pipeline.reconstruct import CAPTURE
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.workspace import POSES_JSON

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,10 +25,12 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.prepare.loaded import check_same_run, reload_run
 from gs2d.pipeline.prepare.open_capture import OpenCapture
 from gs2d.pipeline.prepare.options import Training
-from gs2d.pipeline.prepare.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare.predicted_views import with_predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, resolve, robust_and_exposure
 from gs2d.render.backends import get_backend
 from gs2d.training.events import Event, Notice, OnEvent
+from gs2d.training.learned.predicted_exposure import predicted_exposures
+from gs2d.training.learned.quantity import LearnedQuantity
 
 COUNT = 12
 
@@ -111,8 +114,8 @@ def test_training_is_robust_where_protocol_and_capture_allow_it(
 def predicted(gains: np.ndarray) -> float:
     """The gain that the last view of the ring would have, by those of the others."""
     scene = ring(gains, test=1)
-    found = with_predicted(exposed(scene, gains))
-    return float(found.test[0].appearance["exposure"][0, 0])
+    found = predicted_exposures(exposed(scene, gains))
+    return float(found[scene.test[0].name][0, 0])
 
 
 def exposed(scene: Scene, gains: np.ndarray) -> Scene:
@@ -130,8 +133,8 @@ def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
     """The gain that the last view of the ring would have, where the scene is so bright in each view."""
     scene = ring(gains, test=1)
     brightness = {view.name: float(value) for view, value in zip(scene.views, seen, strict=True)}
-    found = with_predicted(exposed(scene, gains), lambda view: brightness[view.name])
-    return float(found.test[0].appearance["exposure"][0, 0])
+    found = predicted_exposures(exposed(scene, gains), lambda view: brightness[view.name])
+    return float(found[scene.test[0].name][0, 0])
 
 
 def test_exposures_that_follow_brightness_are_predicted_from_it() -> None:
@@ -139,6 +142,20 @@ def test_exposures_that_follow_brightness_are_predicted_from_it() -> None:
     gains = (seen + 0.02) ** -0.8
     gains /= gains[:-1].mean()
     assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.02)
+
+
+def test_quantities_of_packages_are_predicted_as_exposures_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Haze(LearnedQuantity):
+        @staticmethod
+        def predicted(scene: Scene, brightness: Callable[[View], float] | None) -> dict[str, np.ndarray]:
+            mean = np.mean([view.appearance["haze"] for view in scene.train], axis=0)
+            return {view.name: mean for view in scene.test}
+
+    monkeypatch.setattr("gs2d.pipeline.prepare.predicted_views.QUANTITIES", {"haze": Haze})
+    scene = ring(np.ones(4), test=1)
+    hazy = {view.name: {"haze": np.full(1, float(index))} for index, view in enumerate(scene.train)}
+    shown = with_predicted(scene.with_appearance(hazy))
+    assert shown.test[0].appearance["haze"] == pytest.approx(np.mean(range(len(scene.train))))
 
 
 def test_another_removal_changes_stage_keys_and_runs(undisturbed: RunFolder, tmp_path: Path) -> None:

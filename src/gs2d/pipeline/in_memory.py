@@ -27,7 +27,7 @@ from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import Trained, trained_elsewhere
 from gs2d.pipeline.prepare.open_capture import capture_in_memory
 from gs2d.pipeline.prepare.options import MeshOptions, Training
-from gs2d.pipeline.prepare.predicted_exposure import predicted
+from gs2d.pipeline.prepare.predicted_views import predicted
 from gs2d.pipeline.prepare.resolve import recipe_of, resolve
 from gs2d.training.events import Event, Notice, OnEvent, Progress, StageStarted, ignore
 from gs2d.training.trainer import Trainer

@@ -27,7 +27,7 @@ from gs2d.pipeline.prepare.learned_views import with_learned_appearance, write_a
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.predicted_exposure import predicted
+from gs2d.pipeline.prepare.predicted_views import predicted
 from gs2d.pipeline.train.train_run import finish
 from gs2d.training.events import OnEvent
 

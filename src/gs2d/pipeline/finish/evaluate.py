@@ -27,7 +27,7 @@ from gs2d.pipeline.finish.scoring import RenderedPhotograph, score_views, split_
 from gs2d.pipeline.prepare.learned_views import over, photographed
 from gs2d.pipeline.prepare.loaded import Trained, open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
-from gs2d.pipeline.prepare.predicted_exposure import predicted
+from gs2d.pipeline.prepare.predicted_views import predicted
 from gs2d.render.api import rasterize
 from gs2d.render.exposure_transform import expose, fit_exposure
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore

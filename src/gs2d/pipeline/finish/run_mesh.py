@@ -46,7 +46,7 @@ from gs2d.pipeline.prepare.limits import release, release_buffers, use_threads
 from gs2d.pipeline.prepare.loaded import Trained, checked_output, open_finished, trained_elsewhere
 from gs2d.pipeline.prepare.open_capture import choose_backend
 from gs2d.pipeline.prepare.options import MeshOptions
-from gs2d.pipeline.prepare.predicted_exposure import LUMA
+from gs2d.pipeline.prepare.predicted_views import LUMA
 from gs2d.render.types import RenderOutput
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 

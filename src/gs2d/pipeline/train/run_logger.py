@@ -23,7 +23,7 @@ from gs2d.pipeline.finish.scoring import mean_psnr, peak_memory, score_views, sp
 from gs2d.pipeline.prepare.learned_views import write_appearance, write_poses
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun, Trained
-from gs2d.pipeline.prepare.predicted_exposure import predicted, with_predicted
+from gs2d.pipeline.prepare.predicted_views import predicted, with_predicted
 from gs2d.pipeline.prepare.resolve import checkpoint_interval
 from gs2d.pipeline.train.resume import put_in_cache
 from gs2d.training import events

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,11 @@ from torch import Tensor
 
 from gs2d.config.quantities import QUANTITIES, Quantity
 from gs2d.config.validate import one_of
-from gs2d.data.scene import Scene
+from gs2d.data.scene import Scene, View
 from gs2d.errors import RecipeError
 from gs2d.render.exposure_transform import expose, identity
 from gs2d.training.learned.point_gains import point_gains
+from gs2d.training.learned.predicted_exposure import predicted_exposures
 from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity, QuantityReport
 
 
@@ -69,6 +70,11 @@ class ImageExposure(LearnedQuantity):
     def penalty(self, numbers: Tensor, index: int) -> Tensor:
         """Return the weighted squared difference of the transform from the identity."""
         return self.settings.prior * (numbers - identity(numbers)).square().sum()
+
+    @staticmethod
+    def predicted(scene: Scene, brightness: Callable[[View], float] | None) -> dict[str, np.ndarray]:
+        """Return exposures of test views, from neighbouring photographs and the brightness of the view."""
+        return predicted_exposures(scene, brightness)
 
     @classmethod
     def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:

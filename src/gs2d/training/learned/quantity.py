@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -144,6 +144,25 @@ class LearnedQuantity:
     def place(self, values: Tensor, scene: Scene) -> Scene:
         """Return a scene with the learned numbers in its cameras."""
         return scene
+
+    @staticmethod
+    def predicted(scene: Scene, brightness: Callable[[View], float] | None) -> Mapping[str, np.ndarray]:
+        """Return numbers of test views by name, from the ``appearance`` of the training views.
+
+        Parameters
+        ----------
+        scene : Scene
+            Training views have their learned numbers; photographs of test views must not be used.
+        brightness : callable or None
+            Returns the mean brightness, from 0 to 1, of a view as the scene is rendered; None where rendering costs
+            too much.
+
+        Returns
+        -------
+        mapping of str to ndarray
+            Views that are not named are rendered without the quantity. Default: none.
+        """
+        return {}
 
     @classmethod
     def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:

@@ -9,15 +9,13 @@ photographs are not used.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from gs2d.core.camera import Camera
-from gs2d.data import Scene, View
-from gs2d.pipeline.prepare.loaded import Trained
+from gs2d.data.scene import Scene, View
 from gs2d.render.exposure_transform import identity
 
 NEIGHBOURS = 5  # training photographs used by a prediction
@@ -25,35 +23,18 @@ CLOSE = 0.02  # added to distances, in extents
 GREY = 0.5
 MAX_VARIANCE = 0.9  # brightness is used if its residual variance is below this times that of neighbours
 ENOUGH = 8  # training photographs to fit a line
-METERED = 256  # px, longer side of the rendering that is metered; smaller ones widen thin splats
-LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 DARK = 0.02  # added to a brightness before its logarithm
 LEAST_GAIN = 0.05
 
 
-def brightness(trained: Trained, view: View) -> float:
-    """Return the brightness of a view: the mean of its rendering in the mean exposure."""
-    camera = view.camera
-    small = METERED / max(camera.width, camera.height)
-    if small < 1:
-        camera = camera.resized(max(1, round(small * camera.width)), max(1, round(small * camera.height)))
-    color = trained.render(camera).color
-    return float((color.clamp_min(0).mean(dim=(0, 1)).double().cpu() * torch.tensor(LUMA).double()).sum())
-
-
-def predicted(trained: Trained) -> Trained:
-    """Return the result of training with predicted exposures of test views (:func:`with_predicted`)."""
-    return replace(trained, scene=with_predicted(trained.scene, partial(brightness, trained)))
-
-
-def with_predicted(scene: Scene, brightness: Callable[[View], float] | None = None) -> Scene:
-    """Return a scene with predicted exposures of test views; unchanged if training views have none.
+def predicted_exposures(scene: Scene, brightness: Callable[[View], float] | None = None) -> dict[str, np.ndarray]:
+    """Return predicted exposures [3, 4] of test views by name; none if a training view has none.
 
     The scene has the learned appearance of its training views. Without the ``brightness`` of views only neighbours are
     used.
     """
     if not scene.test or any("exposure" not in view.appearance for view in scene.train):
-        return scene
+        return {}
     cameras = [view.camera for view in scene.train]
     offsets = torch.from_numpy(np.stack([view.appearance["exposure"] for view in scene.train]))
     offsets = offsets - identity(offsets)
@@ -72,8 +53,8 @@ def with_predicted(scene: Scene, brightness: Callable[[View], float] | None = No
         if meter is not None and brightness is not None:
             own = 1 + float((GREY * transform[:, :3].sum(dim=1) + transform[:, 3] - GREY).mean()) / GREY
             transform = transform * (meter.gain(brightness(view), weights) / max(own, LEAST_GAIN))
-        found[view.name] = {"exposure": transform.numpy()}
-    return scene.with_appearance(found)
+        found[view.name] = transform.numpy()
+    return found
 
 
 @dataclass(frozen=True)
