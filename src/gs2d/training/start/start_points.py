@@ -1,4 +1,4 @@
-"""Points to start from: swept ones, interpolated ones where photographs have no texture, and sparse ones elsewhere."""
+"""Points to start from: swept ones, ones in the gaps between them, and sparse ones elsewhere."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ REPEATED = 3.0  # cells: nearer to a swept point, a sparse point starts no splat
 def start_points(
     scene: Scene, sweep: Sweep, settings: DenseStart, around: tuple[np.ndarray, ...] | None = None
 ) -> PointCloud:
-    """Return points to start from: swept ones, interpolated ones, and sparse ones that are far from the swept ones.
+    """Return points to start from: swept ones, ones in gaps, and sparse ones that are far from the swept ones.
 
     For a fitted start, sparse points keep the size that they have among all sparse points (:attr:`PointCloud.sizes`).
 
