@@ -29,11 +29,15 @@ def scene_with(bare: Places) -> Scene:
     return replace(wall(), train=tuple(views), points=None)
 
 
-def with_depth_in_patch(sweep: Sweep, depth: float) -> Sweep:
-    """Return the sweep with another depth in the patch."""
+def slit(places: np.ndarray) -> np.ndarray:
+    return np.asarray((np.abs(places[..., 0] - 0.2) < 0.3) & (np.abs(places[..., 1]) < 0.9))
+
+
+def with_depth_in_patch(sweep: Sweep, depth: float, where: Places = patch) -> Sweep:
+    """Return the sweep with another depth in the patch, and that of the wall elsewhere."""
     depths = []
     for view, found in zip(sweep.views, sweep.depths, strict=True):
-        inside = patch(unproject(view, np.full(found.shape, WALL)))
+        inside = where(unproject(view, np.full(found.shape, WALL)))
         depths.append(np.where(inside, depth, np.where(found > 0, WALL, 0)))
     return replace(sweep, depths=depths)
 
@@ -58,6 +62,14 @@ def test_points_start_on_a_bare_part_of_a_wall(monkeypatch: pytest.MonkeyPatch) 
 def test_a_wide_gap_with_texture_stays_open() -> None:
     scene = scene_with(lambda places: np.zeros(places.shape[:-1], bool))
     assert len(started_in_patch(scene, with_depth_in_patch(sweep_views(scene, SETTINGS), 0))) == 0
+
+
+def test_a_narrow_gap_may_have_texture(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_with(lambda places: np.zeros(places.shape[:-1], bool))
+    sweep = with_depth_in_patch(sweep_views(scene, SETTINGS), 0, slit)
+    found = len(start_points(scene, sweep, SETTINGS).points)
+    monkeypatch.setattr("gs2d.training.start.start_points.library_for", lambda _: None)
+    assert len(start_points(scene, sweep, SETTINGS).points) <= found - 3
 
 
 def test_a_gap_that_views_see_through_stays_open() -> None:

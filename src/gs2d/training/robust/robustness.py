@@ -142,8 +142,14 @@ class Robustness:
         recipe, dense = self._recipe, self._recipe.dense_start is not None and not self.lacks
         if init is None or dense:
             start = with_known_points(self.scene, recipe)
-            options = {"random_points": recipe.init_points, "near": near, "generator": generator, "dtype": dtype}
-            initial = initial_splats(start, sh_degree=recipe.sh_degree, **options)  # type: ignore[arg-type]
+            initial = initial_splats(
+                start,
+                sh_degree=recipe.sh_degree,
+                random_points=recipe.init_points,
+                near=near,
+                generator=generator,
+                dtype=dtype,
+            )
             source = initial.source if start is self.scene else "depths"
             source = "sweep" if source == "points" and dense else source
             sweep, self._sweep = self._sweep, None
