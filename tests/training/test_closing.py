@@ -12,7 +12,7 @@ from gs2d.config.recipe import DenseStart
 from gs2d.data.scene import Scene, View
 from gs2d.training.start import plane_sweep
 from gs2d.training.start.plane_sweep import Sweep, sweep_views, unproject
-from gs2d.training.start.start_points import Found, levelled, start_points
+from gs2d.training.start.start_points import StartPoints, levelled, start_points
 from wall_scene import WALL, image, wall
 
 SETTINGS = DenseStart(side=48, min_angle=1.0, cell=1.5)
@@ -79,18 +79,18 @@ def test_a_gap_that_views_see_through_stays_open() -> None:
     assert len(started_in_patch(scene, with_depth_in_patch(sweep, 2 * WALL))) == 0
 
 
-def found_at(places: np.ndarray) -> Found:
+def points_at(places: np.ndarray) -> StartPoints:
     count, random = len(places), np.random.default_rng(1)
     normals = random.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Found(places, np.full((count, 3), 0.5), normals, np.full(count, 0.01), np.zeros(count))
+    return StartPoints(places, np.full((count, 3), 0.5), normals, np.full(count, 0.01), np.zeros(count))
 
 
 def test_points_move_onto_the_plane_around_them() -> None:
     random = np.random.default_rng(0)
     flat = np.stack([*random.uniform(-1, 1, (2, 4000)), random.normal(0, 0.01, 4000)], axis=1)
     flat[:40, 2] += 0.08  # outliers do not tilt it
-    moved = levelled(found_at(flat), 3.0)
+    moved = levelled(points_at(flat), 3.0)
     inner = (np.abs(moved.places[:, :2]) < 0.9).all(axis=1) & (np.abs(moved.places[:, 2]) < 0.05)
     assert moved.places[inner, 2].std() < 0.004
     assert np.median(np.abs(moved.normals[inner, 2])) > 0.98
@@ -99,5 +99,5 @@ def test_points_move_onto_the_plane_around_them() -> None:
 def test_points_of_a_wire_stay() -> None:
     random = np.random.default_rng(0)
     wire = np.stack([np.linspace(0, 3, 300), *random.normal(0, 0.004, (2, 300))], axis=1)
-    moved = levelled(found_at(wire), 3.0)
+    moved = levelled(points_at(wire), 3.0)
     assert (moved.places == wire).all(axis=1).mean() > 0.9

@@ -34,27 +34,27 @@ def gap_points(
     ``places`` [P, 3] and ``pixel`` [P], the size of a pixel there, are of the swept points, which are ``cell`` pixels
     apart.
     """
-    known = {
+    depths = {
         index: np.where(sweep.known(index), sweep.depths[index], 0)
         for index in range(len(sweep.views))
         if sweep.neighbours[index]
     }
     centers = np.stack([-view.T[:3, :3].T @ view.T[:3, 3] for view in sweep.views])
     spacing = cell * pixel
-    faces = _facets(sweep, known, centers, places, pixel, spacing, library)
+    faces = _facets(sweep, depths, centers, places, pixel, spacing, library)
     corners = places[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) / spacing[faces].max(axis=1)
     crossing = (edges > GAP) & (edges <= LONGEST)
-    found, which = _spread(corners[crossing], spacing[faces[crossing]].max(axis=1))
+    samples, which = _spread(corners[crossing], spacing[faces[crossing]].max(axis=1))
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[crossing]
     normals = (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))[which]
-    kept, colors = _believed(sweep, known, centers, found, normals, (edges[crossing] <= NARROW)[which])
-    return found[kept], colors[kept], normals[kept], pixel[faces[crossing]].mean(axis=1)[which][kept]
+    kept, colors = _believed(sweep, depths, centers, samples, normals, (edges[crossing] <= NARROW)[which])
+    return samples[kept], colors[kept], normals[kept], pixel[faces[crossing]].mean(axis=1)[which][kept]
 
 
 def _facets(
     sweep: Sweep,
-    known: Mapping[int, np.ndarray],
+    depths: Mapping[int, np.ndarray],
     centers: np.ndarray,
     places: np.ndarray,
     pixel: np.ndarray,
@@ -63,11 +63,11 @@ def _facets(
 ) -> np.ndarray:
     """Return the facets of the minimum cut, rows of ``places`` [F, 3], counter-clockwise seen from free space."""
     ends, cameras, count = [], [], np.zeros(len(places), np.int64)
-    for index in np.random.default_rng(0).permutation(list(known)):
+    for index in np.random.default_rng(0).permutation(list(depths)):
         z, column, row, inside = project(sweep.views[index], places)
-        seen = inside & (np.abs(known[index][row, column] - z) <= AGREE * z) & (count < LINES)
-        count += seen
-        ends.append(np.flatnonzero(seen))
+        visible = inside & (np.abs(depths[index][row, column] - z) <= AGREE * z) & (count < LINES)
+        count += visible
+        ends.append(np.flatnonzero(visible))
         cameras.append(np.full(len(ends[-1]), index))
     end = np.concatenate(ends)
     space = divide(places, centers, library)
@@ -92,7 +92,7 @@ def _spread(corners: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _believed(
     sweep: Sweep,
-    known: Mapping[int, np.ndarray],
+    depths: Mapping[int, np.ndarray],
     centers: np.ndarray,
     places: np.ndarray,
     normals: np.ndarray,
@@ -105,16 +105,16 @@ def _believed(
     """
     bare, other, through = (np.zeros(len(places), np.int64) for _ in range(3))
     colors = np.zeros((len(places), 3))
-    for index, depth in known.items():
+    for index, depth in depths.items():
         view = sweep.views[index]
         z, column, row, inside = project(view, places)
         there, color = depth[row, column], view.color.permute(1, 2, 0)
         ray = centers[index] - places
         facing = (ray * normals).sum(axis=1) > FACING * np.linalg.norm(ray, axis=1)
-        seen = inside & facing & ((there == 0) | (np.abs(there - z) <= THROUGH * z))
-        flat = seen & view.usable[row, column] & (narrow | (flatness(color).numpy() > BARE)[row, column])
+        visible = inside & facing & ((there == 0) | (np.abs(there - z) <= THROUGH * z))
+        flat = visible & view.usable[row, column] & (narrow | (flatness(color).numpy() > BARE)[row, column])
         bare += flat
-        other += seen & ~flat
+        other += visible & ~flat
         through += inside & (there > (1 + THROUGH) * z)
         colors += flat[:, None] * color.numpy()[row, column]
     return (bare >= np.maximum(VOTES, other)) & (through == 0), colors / np.maximum(bare, 1)[:, None]

@@ -56,7 +56,7 @@ def start_points(
     swept = levelled(swept, settings.cell)
     between = _between(sweep, swept, settings.cell)
     parts: list[tuple[np.ndarray, ...]] = [
-        (found.places, found.colors, found.normals, np.zeros(len(found.places))) for found in (swept, between)
+        (points.places, points.colors, points.normals, np.zeros(len(points.places))) for points in (swept, between)
     ]
     if scene.points is not None and _has_points(scene):
         parts.append(_apart(scene.points, swept, settings.cell))
@@ -79,7 +79,7 @@ def _has_points(scene: Scene) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class StartPoints:
     """Points that start splats."""
 
     places: np.ndarray  # [M, 3] world units
@@ -88,32 +88,34 @@ class Found:
     pixel: np.ndarray  # [M] world units: the size of a pixel there
     score: np.ndarray  # [M]
 
-    def rows(self, which: np.ndarray) -> Found:
+    def rows(self, which: np.ndarray) -> StartPoints:
         """Return some of the points."""
-        return Found(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+        return StartPoints(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
-def _joined(found: Sequence[Found]) -> Found:
-    return Found(*(np.concatenate([getattr(f, name) for f in found]) for name in Found.__dataclass_fields__))
+def _joined(points: Sequence[StartPoints]) -> StartPoints:
+    return StartPoints(
+        *(np.concatenate([getattr(f, name) for f in points]) for name in StartPoints.__dataclass_fields__)
+    )
 
 
-def _thinned(found: Iterable[Found], cell: float) -> Found:
+def _thinned(points: Iterable[StartPoints], cell: float) -> StartPoints:
     """Thin the points of all views together, without having all of them in memory."""
-    waiting: list[Found] = []
-    for some in found:
+    waiting: list[StartPoints] = []
+    for some in points:
         waiting.append(some)
         if sum(len(one.score) for one in waiting) > max(WAITING, 2 * len(waiting[0].score)):
             waiting = [_thin(_joined(waiting), cell)]
     return _thin(_joined(waiting), cell)
 
 
-def _thin(found: Found, cell: float) -> Found:
+def _thin(points: StartPoints, cell: float) -> StartPoints:
     """Keep the point with the best score in each cell of ``cell`` pixels; cell sizes are powers of two."""
-    level = np.rint(np.log2(found.pixel * cell))
-    keys = np.concatenate([np.floor(found.places / np.exp2(level)[:, None]), level[:, None]], axis=1)
-    order = np.argsort(-found.score, kind="stable")
+    level = np.rint(np.log2(points.pixel * cell))
+    keys = np.concatenate([np.floor(points.places / np.exp2(level)[:, None]), level[:, None]], axis=1)
+    order = np.argsort(-points.score, kind="stable")
     _, first = _unique_rows(keys[order])
-    return found.rows(order[first])
+    return points.rows(order[first])
 
 
 def _unique_rows(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,44 +131,44 @@ def _unique_rows(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return keys[first], first
 
 
-def _swept(sweep: Sweep, index: int) -> Found:
+def _swept(sweep: Sweep, index: int) -> StartPoints:
     """Return the points of a view on which enough neighbours agree."""
     view, depth, kept = sweep.views[index], sweep.depths[index], sweep.known(index)
     places = unproject(view, depth)
     normals = np.cross(np.gradient(places, axis=1), np.gradient(places, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     colors, score = view.color.permute(1, 2, 0).numpy(), sweep.scores[index]
-    return Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], score[kept])
+    return StartPoints(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], score[kept])
 
 
-def _between(sweep: Sweep, swept: Found, cell: float) -> Found:
+def _between(sweep: Sweep, swept: StartPoints, cell: float) -> StartPoints:
     """Return points in the gaps between swept ones; none without the native library, which cuts tetrahedra."""
     library = library_for(sweep.views[0].grey)
     if library is None or len(swept.places) < LEAST_SWEPT:
         return swept.rows(np.zeros(0, np.int64))
     places, colors, normals, pixel = gap_points(sweep, swept.places, swept.pixel, cell, library)
-    found = Found(places, colors, normals, pixel, np.zeros(len(places)))
-    return _thin(found.rows(cKDTree(swept.places).query(places)[0] > cell * pixel), GAP_CELL * cell)
+    points = StartPoints(places, colors, normals, pixel, np.zeros(len(places)))
+    return _thin(points.rows(cKDTree(swept.places).query(places)[0] > cell * pixel), GAP_CELL * cell)
 
 
-def levelled(found: Found, cell: float) -> Found:
+def levelled(points: StartPoints, cell: float) -> StartPoints:
     """Move points onto the planes that their neighbours lie on, and give them the normals of these planes.
 
     Weights fall with the distance from the point and, in three turns, with that from the plane. Points whose neighbours
     do not lie on a plane stay.
     """
-    places, normals = found.places.copy(), found.normals.copy()
+    places, normals = points.places.copy(), points.normals.copy()
     if len(places) < NEIGHBOURS:
-        return found
-    tree = cKDTree(found.places)
+        return points
+    tree = cKDTree(points.places)
     for rows in np.array_split(np.arange(len(places)), len(places) // ROWS_AT_ONCE + 1):
-        distance, near = tree.query(found.places[rows], k=NEIGHBOURS)
-        reach = REACH * cell * found.pixel[rows, None]
+        distance, near = tree.query(points.places[rows], k=NEIGHBOURS)
+        reach = REACH * cell * points.pixel[rows, None]
         weight = np.maximum(1 - (distance / reach) ** 2, 0) ** 2
         for _ in range(TURNS):
             total = np.maximum(weight.sum(axis=1), 1e-12)
-            middle = np.einsum("nk,nka->na", weight, found.places[near]) / total[:, None]
-            arms = found.places[near] - middle[:, None]
+            middle = np.einsum("nk,nka->na", weight, points.places[near]) / total[:, None]
+            arms = points.places[near] - middle[:, None]
             spread, axes = np.linalg.eigh(np.einsum("nk,nka,nkb->nab", weight, arms, arms) / total[:, None, None])
             normal = axes[:, :, 0]
             off = np.einsum("nka,na->nk", arms, normal) / (3 * np.sqrt(np.maximum(spread[:, :1], 1e-30)))
@@ -174,13 +176,13 @@ def levelled(found: Found, cell: float) -> Found:
         flat = (spread[:, 0] < FLAT * spread[:, 1]) & (spread[:, 1] > WIDE * spread[:, 2])
         flat &= (weight > 0).sum(axis=1) >= LEAST_ON_PLANE
         rows, normal = rows[flat], normal[flat]
-        height = np.einsum("na,na->n", found.places[rows] - middle[flat], normal)
+        height = np.einsum("na,na->n", points.places[rows] - middle[flat], normal)
         places[rows] -= height[:, None] * normal
         normals[rows] = normal
-    return replace(found, places=places, normals=normals)
+    return replace(points, places=places, normals=normals)
 
 
-def _apart(points: PointCloud, swept: Found, cell: float) -> tuple[np.ndarray, ...]:
+def _apart(points: PointCloud, swept: StartPoints, cell: float) -> tuple[np.ndarray, ...]:
     """Return sparse points far from the swept ones: positions, colours in [0, 1], zero normals, sizes."""
     finite = np.logical_and.reduce(np.isfinite(points.points), axis=1)
     places = np.asarray(points.points, dtype=np.float64)[finite]
