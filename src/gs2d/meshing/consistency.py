@@ -48,10 +48,10 @@ def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits
 def _nearest(centers: np.ndarray) -> np.ndarray:
     """Return the indices [V, NEIGHBOURS] of the nearest other camera centres [V, 3]; fewer if there are fewer views."""
     count = min(NEIGHBOURS, len(centers) - 1)
-    found = np.empty((len(centers), count), np.int64)
+    indices = np.empty((len(centers), count), np.int64)
     for start in range(0, len(centers), _AT_ONCE):
         rows = np.arange(start, min(start + _AT_ONCE, len(centers)))
         distance = np.linalg.norm(centers[rows, None] - centers[None], axis=2)
         distance[rows - start, rows] = np.inf
-        found[rows] = np.argsort(distance, axis=1, kind="stable")[:, :count]
-    return found
+        indices[rows] = np.argsort(distance, axis=1, kind="stable")[:, :count]
+    return indices

@@ -52,7 +52,7 @@ def depth_map(frame: RenderedView) -> DepthMap:
     color = None if frame.color is None else _array(frame.color)
     valid = None if frame.valid is None else _array(frame.valid)
     check_shapes({"depth": (depth, f"{camera.height} {camera.width}")})
-    seen = depth > 0
+    usable = depth > 0
     weight = None
     if valid is not None:
         check_shapes({"valid": (valid, f"{camera.height} {camera.width}")})
@@ -60,12 +60,12 @@ def depth_map(frame: RenderedView) -> DepthMap:
             weight = valid.astype(np.float32)
             if not (np.isfinite(weight).all() and (weight >= 0).all()):
                 raise ShapeError("valid must be bool or finite weights >= 0, got negative or non-finite weights")
-        seen &= valid > 0
+        usable &= valid > 0
     if color is not None:
         check_shapes({"color": (color, f"{camera.height} {camera.width} 3")})
         if color.dtype != np.uint8:
             color = np.rint(np.clip(np.nan_to_num(color), 0.0, 1.0) * 255.0).astype(np.uint8)
-    return DepthMap(camera, np.where(seen, depth, 0).astype(np.float32), color, weight)
+    return DepthMap(camera, np.where(usable, depth, 0).astype(np.float32), color, weight)
 
 
 def _array(value: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import components, select_faces
 
 SMALL = 0.01  # of the area of the largest component: smaller components are removed
-SEEN, LEAST_PIXELS = 0.5, 50.0
+VIEW_SHARE, LEAST_PIXELS = 0.5, 50.0
 """Smaller ones stay if they have as many pixels, and this fraction of the views that see the largest one see them. On
 the judge's wheel, loose spokes and hub have 0.55 or more; floaters of 50 px before facades and metal at most 0.3."""
 _TINY = 1e-300
@@ -50,35 +50,35 @@ def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
     vertices_t, normals_t = mesh.vertices.T, _normals(mesh).T
     parts = [slice(start, start + VERTICES_AT_ONCE) for start in range(0, len(mesh.vertices), VERTICES_AT_ONCE)]
     xyz = [np.ascontiguousarray(vertices_t[:, part], np.float32) for part in parts]
-    ahead = [np.ascontiguousarray(normals_t[:, part]) for part in parts]
+    normals = [np.ascontiguousarray(normals_t[:, part]) for part in parts]
     count = len(mesh.vertices)
-    found = Evidence(np.zeros(count, np.int32), *(np.zeros(count, np.float32) for _ in range(3)))
+    evidence = Evidence(np.zeros(count, np.int32), *(np.zeros(count, np.float32) for _ in range(3)))
     for item in maps:
-        for part, vertices, normal in zip(parts, xyz, ahead, strict=True):
-            _count(item, vertices, normal, tolerance, found.rows(part))
-    return found
+        for part, vertices, normal in zip(parts, xyz, normals, strict=True):
+            _count(item, vertices, normal, tolerance, evidence.rows(part))
+    return evidence
 
 
-def _count(item: DepthMap, vertices: np.ndarray, normals: np.ndarray, tolerance: float, found: Evidence) -> None:
+def _count(item: DepthMap, vertices: np.ndarray, normals: np.ndarray, tolerance: float, evidence: Evidence) -> None:
     """Add the evidence of one view for some vertices [3, P] with normals [3, P], in place."""
     camera: Camera = item.camera
-    rows, z, seen, weight = _look(item, vertices)
-    through = np.flatnonzero(seen > z + tolerance)
-    found.against[rows.take(through)] += weight.take(through)
-    here = np.flatnonzero((seen > 0) & (np.abs(seen - z) <= tolerance))
+    rows, z, depth, weight = _lookup(item, vertices)
+    through = np.flatnonzero(depth > z + tolerance)
+    evidence.against[rows.take(through)] += weight.take(through)
+    here = np.flatnonzero((depth > 0) & (np.abs(depth - z) <= tolerance))
     rows, z, weight = rows.take(here), z.take(here), weight.take(here)
     arm = camera.center.astype(np.float32)[:, None] - vertices.take(rows, axis=1)  # [:, rows] would be strided
     length = np.sqrt((arm * arm).sum(axis=0))
     facing = (arm * normals.take(rows, axis=1)).sum(axis=0) / np.maximum(length, np.float32(1e-30))
     front = np.flatnonzero(facing > GRAZING)
     rows, z = rows.take(front), z.take(front)
-    found.views[rows] += 1
-    found.support[rows] += weight.take(front)
+    evidence.views[rows] += 1
+    evidence.support[rows] += weight.take(front)
     near = np.float32(camera.fx * camera.fy) * facing.take(front) / (z * z)
-    found.density[rows] = np.maximum(found.density.take(rows), near)
+    evidence.density[rows] = np.maximum(evidence.density.take(rows), near)
 
 
-def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _lookup(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the indices of vertices [3, P] in the image, their depths, and depths and weights of the view there."""
     camera: Camera = item.camera
     x, y, z = camera.rotation.astype(np.float32) @ vertices + camera.T_cam_world[:3, 3:].astype(np.float32)
@@ -105,10 +105,10 @@ def _normals(mesh: Mesh) -> np.ndarray:
 
 def areas(mesh: Mesh) -> np.ndarray:
     """Return the areas [F] of the faces, world units^2."""
-    vertices, found = mesh.vertices.astype(np.float64), np.empty(len(mesh.faces))
+    vertices, area = mesh.vertices.astype(np.float64), np.empty(len(mesh.faces))
     for part in _parts(len(mesh.faces)):
-        found[part] = 0.5 * np.linalg.norm(_crosses(vertices[mesh.faces[part]]), axis=1)
-    return found
+        area[part] = 0.5 * np.linalg.norm(_crosses(vertices[mesh.faces[part]]), axis=1)
+    return area
 
 
 def _crosses(corners: np.ndarray) -> np.ndarray:
@@ -123,10 +123,10 @@ def _parts(count: int) -> list[slice]:
 
 def pixels(mesh: Mesh, evidence: Evidence) -> float:
     """Return how many pixels show the surface, each part counted in the view with the highest resolution."""
-    found = areas(mesh)
-    for part in _parts(len(found)):
-        found[part] *= evidence.density[mesh.faces[part]].mean(axis=1)
-    return float(found.sum())
+    area = areas(mesh)
+    for part in _parts(len(area)):
+        area[part] *= evidence.density[mesh.faces[part]].mean(axis=1)
+    return float(area.sum())
 
 
 def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float, *, small: float = SMALL) -> tuple[Mesh, float]:
@@ -159,7 +159,7 @@ def large_components(mesh: Mesh, evidence: Evidence, fraction: float = SMALL) ->
     area = np.bincount(of_face, area_of_face)
     shown = np.bincount(of_face, area_of_face * evidence.density[mesh.faces].mean(axis=1))
     views = np.bincount(of_face, area_of_face * evidence.views[mesh.faces].mean(axis=1)) / np.maximum(area, _TINY)
-    kept = (area >= fraction * area.max()) | ((shown >= LEAST_PIXELS) & (views >= SEEN * views[area.argmax()]))
+    kept = (area >= fraction * area.max()) | ((shown >= LEAST_PIXELS) & (views >= VIEW_SHARE * views[area.argmax()]))
     return _selected(mesh, evidence, kept[of_face])
 
 

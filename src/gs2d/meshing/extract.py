@@ -29,7 +29,7 @@ SAMPLES = 1 << 19  # of all depth maps: 40 MB
 
 @dataclass(frozen=True)
 class Extraction:
-    """A mesh and facts about its extraction."""
+    """A mesh and statistics of its extraction."""
 
     mesh: Mesh
     limits: FusionBounds

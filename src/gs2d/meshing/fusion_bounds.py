@@ -156,7 +156,7 @@ def _farthest_corner(lower: np.ndarray, upper: np.ndarray, cameras: Sequence[Cam
 
 
 def check_positive(**values: float | None) -> None:
-    """Raise ProtocolError for a given number that is not positive and finite."""
+    """Raise ProtocolError for a number that is not positive and finite; None is accepted."""
     for name, value in values.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise ProtocolError(f"{name} must be positive, got {value}")

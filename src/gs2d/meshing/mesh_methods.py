@@ -30,7 +30,7 @@ WHOLE = "unbounded"  # of the whole scene: with equal voxels thin things near th
 
 
 def method_name(method: str, *, watertight: bool, whole_scene: bool) -> str:
-    """Return the name of the method that options ask for; only Delaunay tetrahedra close a surface."""
+    """Return the name of the method that options select; only Delaunay tetrahedra close a surface."""
     if watertight:
         return "delaunay"
     return WHOLE if whole_scene and method == "tsdf" and WHOLE in MESH_METHODS else method

@@ -86,7 +86,7 @@ def outside(
 def minimum_cut_on_cpu(
     library: Library, neighbours: np.ndarray, mirror: np.ndarray, capacity: np.ndarray, terminal: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """Return the source side [N] bool and the flow; ``capacity`` and ``terminal`` become what is left."""
+    """Return the source side [N] bool and the flow; ``capacity`` and ``terminal`` become the residual capacities."""
     side = np.zeros(len(neighbours), np.uint8)
     arrays = {"neighbours": neighbours, "mirror": mirror, "capacity": capacity, "terminal": terminal}
     arguments = arguments_of("gs2d_minimum_cut", **arrays, source_side=side, nodes=len(neighbours))
@@ -98,14 +98,14 @@ def minimum_cut_on_cpu(
 
 def _areas(space: Tetrahedra, spacing: np.ndarray) -> np.ndarray:
     """Return the areas of the facets, in squares of the largest spacing of their corners, [T, 4] float32."""
-    every = np.full(len(space.xyz), np.median(spacing))
-    every[: len(spacing)] = spacing
-    found = np.empty(space.corners.shape, np.float32)
+    spacings = np.full(len(space.xyz), np.median(spacing))
+    spacings[: len(spacing)] = spacing
+    areas = np.empty(space.corners.shape, np.float32)
     for k in range(4):
         rows = space.corners[:, FACES[k]]
         p, q, r = (space.xyz[rows[:, i]] for i in range(3))
-        found[:, k] = 0.5 * np.linalg.norm(np.cross(q - p, r - p), axis=1) / every[rows].max(axis=1) ** 2
-    return found
+        areas[:, k] = 0.5 * np.linalg.norm(np.cross(q - p, r - p), axis=1) / spacings[rows].max(axis=1) ** 2
+    return areas
 
 
 def _badness(space: Tetrahedra) -> np.ndarray:

@@ -48,8 +48,8 @@ def cast_camera(
     """
     width, height = camera.width * samples, camera.height * samples
     local = vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]  # [P, 3] in camera axes
-    met, low, high = _sample_boxes(local, faces, camera, samples, near)
-    a, b, c = (local[faces[met, k]] for k in range(3))
+    triangles, low, high = _sample_boxes(local, faces, camera, samples, near)
+    a, b, c = (local[faces[triangles, k]] for k in range(3))
     edges = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)  # [F, 3, 3]
     volume = np.einsum("fi,fi->f", a, edges[:, 0])
     directions_x = ((np.arange(width) + 0.5) / samples - camera.cx) / camera.fx
@@ -75,13 +75,13 @@ def cast_camera(
     face, depth = np.full(len(nearest), -1, np.int32), np.zeros(len(nearest), np.float32)
     weights = np.zeros((len(nearest), 3), np.float32)
     depth[hit] = (nearest[hit] >> np.uint64(32)).astype(np.uint32).view(np.float32)
-    every, found = np.flatnonzero(hit), (nearest[hit] & np.uint64(0xFFFFFFFF)).astype(np.int32)
-    face[hit] = met[found]
-    for start in range(0, len(every), _PAIRS_PER_CHUNK):
+    hit_rays, index = np.flatnonzero(hit), (nearest[hit] & np.uint64(0xFFFFFFFF)).astype(np.int32)
+    face[hit] = triangles[index]
+    for start in range(0, len(hit_rays), _PAIRS_PER_CHUNK):
         part = slice(start, start + _PAIRS_PER_CHUNK)
-        rays = every[part]
+        rays = hit_rays[part]
         directions = np.stack([directions_x[rays % width], directions_y[rays // width], np.ones(len(rays))], axis=1)
-        e = np.einsum("rki,ri->rk", edges[found[part]], directions)
+        e = np.einsum("rki,ri->rk", edges[index[part]], directions)
         weights[rays] = e / e.sum(axis=1, keepdims=True)
     return Hits(face.reshape(height, width), depth.reshape(height, width), weights.reshape(height, width, 3))
 
@@ -117,10 +117,10 @@ def _sample_boxes(
     safe = np.where(ahead, local[:, 2], 1.0)
     size = camera.width * samples, camera.height * samples
     focal, center = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    met, crossing = np.arange(len(faces)), np.zeros(0, np.int64)  # faces beyond the near plane, and across it
+    beyond, crossing = np.arange(len(faces)), np.zeros(0, np.int64)  # faces beyond the near plane, and across it
     if not ahead.all():
         corners = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
-        met, crossing = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
+        beyond, crossing = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
 
     def rounded(low: np.ndarray, high: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
         low, high = low * samples - 0.5, high * samples - 0.5
@@ -131,14 +131,14 @@ def _sample_boxes(
     for axis in range(2):
         pixels = local[:, axis] / safe * focal[axis] + center[axis]  # [P]
         first, end = rounded(pixels, pixels, size[axis])
-        a, b, c = (faces[met, k] for k in range(3))
+        a, b, c = (faces[beyond, k] for k in range(3))
         cut_first, cut_end = rounded(*_reach(local[faces[crossing]], axis, focal[axis], center[axis], near), size[axis])
         low = np.concatenate([np.minimum(np.minimum(first[a], first[b]), first[c]), cut_first])
         high = np.concatenate([np.maximum(np.maximum(end[a], end[b]), end[c]), cut_end])
         some = high > low
-        met, crossing = met[some[: len(met)]], crossing[some[len(met) :]]
+        beyond, crossing = beyond[some[: len(beyond)]], crossing[some[len(beyond) :]]
         bounds = [*(bound[some] for bound in bounds), low[some], high[some]]
-    every = np.concatenate([met, crossing])
+    every = np.concatenate([beyond, crossing])
     order = np.argsort(every, kind="stable")
     x0, x1, y0, y1 = (bound[order] for bound in bounds)
     return every[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)

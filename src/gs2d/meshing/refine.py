@@ -49,7 +49,7 @@ T = TypeVar("T")
 CACHE_BYTES = 1 << 29  # limit for images and depth maps in memory
 BYTES_A_PIXEL = 8  # of a face and a depth; photographs have fewer
 SMALL_SIDE = 100  # px, shorter side of the images in which neighbours are chosen
-SEEN_AGAIN = 0.05  # of the depth: tolerance of these coarse images
+DEPTH_TOLERANCE = 0.05  # of the depth: tolerance of these coarse images
 POINTS = 600  # of a view that compare its neighbours
 SPREAD = 0.6  # standard deviation of the logarithm of good angles
 LEAST_GAIN = 0.02  # of the points: a neighbour must add as much
@@ -70,7 +70,7 @@ vertex, from SHINY on they do not. Its median is 0.08 on stone, 0.12 on boxes an
 RARELY, OFTEN = 0.1, 0.3
 """Part of the pixels of a vertex that can be compared, away from outlines and seen by the neighbour: up to RARELY, a
 vertex keeps nothing of its move, from OFTEN on all. Rods, wires and leaves have few of them."""
-KEPT_RINGS = 24  # both are averaged over as many rings: shiny things have matt-looking spots
+TRUST_RINGS = 24  # both are averaged over as many rings: shiny things have matt-looking spots
 
 ReadGrey = Callable[[int, int], GreyImage]
 """Reads photograph ``index``, downscaled by an integer factor."""
@@ -133,7 +133,7 @@ class Refinement:
         self._mesh, self._cameras, self._photographs = mesh, list(cameras), photographs
         self._settings, self._library = settings, library
         self._factors = settings.factors or coarse_to_fine(self._cameras, COARSE_SIDE)
-        self._room = cache_bytes(CACHE_BYTES) // 3  # for photographs, for their usable pixels and for depth maps
+        self._cache_bytes = cache_bytes(CACHE_BYTES) // 3  # for photographs, for their usable pixels and for depth maps
         self._done = 0
         rounds = settings.steps * sum(self._cost(factor) for factor in self._factors) + self._cost(self._factors[0])
         self.work = rounds * len(self._cameras)
@@ -148,9 +148,9 @@ class Refinement:
         ``on_work`` receives the amount of work that is done; ``work`` is the last number that it receives.
         """
         mesh = Mesh(self._mesh.vertices.astype(np.float64), self._mesh.faces)
-        settings, count = self._settings, pixels(mesh, self._seen(mesh))
+        settings, count = self._settings, pixels(mesh, self._visibility(mesh))
         mesh = simplify(mesh, faces=int(count / settings.face_pixels), cameras=self._cameras)
-        density = self._seen(mesh).density.astype(np.float64)
+        density = self._visibility(mesh).density.astype(np.float64)
         if not len(mesh.faces) or not (density > 0).any():
             return self._mesh
         density[density == 0] = np.median(density[density > 0])
@@ -168,7 +168,7 @@ class Refinement:
             colors = self._mesh.colors[cKDTree(self._mesh.vertices).query(now.start)[1]]
         return Mesh(vertices, now.faces, colors)
 
-    def _seen(self, mesh: Mesh) -> Evidence:
+    def _visibility(self, mesh: Mesh) -> Evidence:
         """Return which views see the vertices, and at how many pixels per unit of surface."""
         depths: list[float] = []
         for camera in self._cameras:
@@ -182,12 +182,12 @@ class Refinement:
     def _cached(self, make: Callable[[int], T], cameras: Sequence[Camera]) -> Callable[[int], T]:
         """Cache a function of the index of a view; as many results as fit in memory."""
         largest = BYTES_A_PIXEL * max(camera.width * camera.height for camera in cameras)
-        return lru_cache(max(1, self._room // largest))(make)
+        return lru_cache(max(1, self._cache_bytes // largest))(make)
 
     def _at_size(
         self, now: _Moving, factor: int, neighbours: Sequence[Sequence[int]], on_work: Callable[[int], None]
     ) -> _Moving:
-        """Take the steps at one size of the photographs; at the first, find out which vertices can be believed."""
+        """Take the steps at one size of the photographs; at the first, estimate which vertices can be trusted."""
         cameras = [camera.downscaled(factor) for camera in self._cameras]
         photographs = self._cached(lambda index: self._photographs(index, factor), cameras)
         curvature = Curvature.of(now.vertices, now.faces, now.normals())
@@ -201,11 +201,11 @@ class Refinement:
 
         surface = Surface(now.vertices, now.faces, now.normals())
         if factor == self._factors[0]:
-            matt, kept = self._believed(surface, views(surface), curvature)
+            matt, kept = self._trusted(surface, views(surface), curvature)
             now = replace(now, matt=matt, kept=kept)
         for _ in range(self._settings.steps):
             surface = Surface(now.vertices, now.faces, now.normals())
-            now = self._moved(now, factor, surface.normals, self._pulled(surface, views(surface)), bend)
+            now = self._moved(now, factor, surface.normals, self._derivatives(surface, views(surface)), bend)
         return now
 
     def _views(
@@ -229,7 +229,7 @@ class Refinement:
             beside = [(images(other), drawn(other).depth) for other in neighbours[index]]
             yield images(index), drawn(index), beside
 
-    def _pulled(self, surface: Surface, views: Iterable[ComparedView]) -> Pull:
+    def _derivatives(self, surface: Surface, views: Iterable[ComparedView]) -> Pull:
         """Return the derivatives of all pairs."""
         match, pull = self._settings.match, Pull.zeros(len(surface.vertices))
         for image, drawn, neighbours in views:
@@ -239,7 +239,7 @@ class Refinement:
             gather_vertices(surface, image.camera, drawn.face, by_pixel, pull, match, self._library)
         return pull
 
-    def _believed(
+    def _trusted(
         self, surface: Surface, views: Iterable[ComparedView], curvature: Curvature
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return how matt the surface is at each vertex [P], and the share of its move that it keeps [P]."""
@@ -251,7 +251,7 @@ class Refinement:
             for total, values in zip(sums, (share * weight, weight, compared, at), strict=True):
                 total += np.bincount(drawn.face[at], values[at], len(faces))
         bright, textured, compared, drawn_pixels = (
-            curvature.spread(np.bincount(faces.ravel(), np.repeat(total, 3), len(surface.vertices)), KEPT_RINGS)
+            curvature.spread(np.bincount(faces.ravel(), np.repeat(total, 3), len(surface.vertices)), TRUST_RINGS)
             for total in sums
         )
         shine = bright / np.maximum(textured, TINY)
@@ -264,13 +264,13 @@ class Refinement:
         size = factor * now.size
         curvature = Curvature.of(now.vertices, now.faces, normals)
         stiff = csr_array(curvature.change.T @ diags_array(BENDING * curvature.areas))
-        hold = TETHER * curvature.areas / size**4
-        away = ((now.vertices - now.start) * normals).sum(axis=1)
+        tether = TETHER * curvature.areas / size**4
+        offset = ((now.vertices - now.start) * normals).sum(axis=1)
         joint = diags_array(np.sqrt(MEMBRANE) / size)
         matrix = (
-            stiff @ curvature.change + joint @ curvature.graph @ joint + diags_array(now.matt * pull.curvature + hold)
+            stiff @ curvature.change + joint @ curvature.graph @ joint + diags_array(now.matt * pull.curvature + tether)
         )
-        right = -(now.matt * pull.gradient + stiff @ (curvature.values - bend) + hold * away)
+        right = -(now.matt * pull.gradient + stiff @ (curvature.values - bend) + tether * offset)
         step = solve(csr_array(matrix), right, steps=SOLVER_STEPS, tolerance=TOLERANCE)
         longest = LONGEST_STEP * size
         return replace(now, vertices=now.vertices + normals * np.clip(step, -longest, longest)[:, None])
@@ -293,7 +293,7 @@ def choose_neighbours(
     """
     small = [camera.downscaled(max(1, min(camera.width, camera.height) // SMALL_SIDE)) for camera in cameras]
     drawn = [draw_mesh(mesh.vertices, mesh.faces, camera, library) for camera in small]
-    found = []
+    neighbours = []
     for index, camera in enumerate(small):
         points, normals = _sampled(mesh, camera, drawn[index])
         rays = points - camera.center
@@ -312,22 +312,22 @@ def choose_neighbours(
             finer = distance * there.fx / np.maximum(length * camera.fx, 1e-300)
             likely = np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / BEST_ANGLE) / SPREAD) ** 2)
             scores[other] = np.where(good, likely * facing * np.minimum(finer, 1 / np.maximum(finer, 1e-9)), 0)
-        found.append(_best(scores, settings.neighbours))
-    return found
+        neighbours.append(_best(scores, settings.neighbours))
+    return neighbours
 
 
 def _best(scores: np.ndarray, most: int) -> tuple[int, ...]:
     """Choose rows of ``scores`` [V, n] one by one."""
     chosen: list[int] = []
-    left = np.ones(scores.shape[1])
+    value = np.ones(scores.shape[1])
     while len(chosen) < most:
-        gains = scores @ left
+        gains = scores @ value
         gains[chosen] = 0
         best = int(np.argmax(gains))
         if not gains[best] > LEAST_GAIN * scores.shape[1]:
             break
         chosen.append(best)
-        left = left * (1 - REPEATED * scores[best])
+        value = value * (1 - REPEATED * scores[best])
     return tuple(chosen)
 
 
@@ -347,5 +347,5 @@ def _visible(points: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarra
     at, z = camera.project(points)
     inside = (z > 0) & (at >= 0).all(axis=1) & (at < (camera.width, camera.height)).all(axis=1)
     column, row = np.where(inside[:, None], at, 0).astype(np.int64).T
-    seen = depth[row, column]
-    return np.asarray(inside & (seen > 0) & (np.abs(seen - z) < SEEN_AGAIN * z))
+    surface = depth[row, column]
+    return np.asarray(inside & (surface > 0) & (np.abs(surface - z) < DEPTH_TOLERANCE * z))

@@ -16,7 +16,7 @@ from gs2d.core.camera import Camera
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.fusion_bounds import FusionBounds
 
-UNSEEN = np.float32(-1e30)  # depth of invalid pixels: so small that every weight becomes 0, without NaN
+INVALID_DEPTH = np.float32(-1e30)  # depth of invalid pixels: so small that every weight becomes 0, without NaN
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class DepthSampler:
     height: int
     focal: float  # px, the larger one
     principal: tuple[float, float]  # px, including the border
-    depth: np.ndarray  # [P] float32, UNSEEN at invalid pixels
+    depth: np.ndarray  # [P] float32, INVALID_DEPTH at invalid pixels
     slope_x: np.ndarray  # [P] float32 world units/px
     slope_y: np.ndarray
     color: np.ndarray | None  # [P, 3] float32
@@ -65,11 +65,11 @@ def make_sampler(item: DepthMap, limits: FusionBounds, truncation: np.ndarray | 
     K = camera.K.copy()
     K[:2, 2] += 1.0  # the border
     depth = np.pad(np.where(item.depth <= limits.depth_limit, item.depth, 0), 1).astype(np.float32)
-    seen = np.where(depth > 0, depth, np.float32(np.nan))
+    valid_depth = np.where(depth > 0, depth, np.float32(np.nan))
     # A slope changes depth by at most half a truncation within the pixel; a steeper one is an edge.
     largest = limits.truncation if truncation is None else np.pad(truncation, 1)
-    slope_x = _minmod(seen, axis=1, largest=largest)
-    slope_y = _minmod(seen, axis=0, largest=largest)
+    slope_x = _minmod(valid_depth, axis=1, largest=largest)
+    slope_y = _minmod(valid_depth, axis=0, largest=largest)
     color = None if item.color is None else np.pad(item.color, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
     return DepthSampler(
         projection=K @ camera.T_cam_world[:3],
@@ -77,7 +77,7 @@ def make_sampler(item: DepthMap, limits: FusionBounds, truncation: np.ndarray | 
         height=camera.height + 2,
         focal=max(camera.fx, camera.fy),
         principal=(K[0, 2], K[1, 2]),
-        depth=np.where(depth > 0, depth, UNSEEN).reshape(-1),
+        depth=np.where(depth > 0, depth, INVALID_DEPTH).reshape(-1),
         slope_x=slope_x.reshape(-1),
         slope_y=slope_y.reshape(-1),
         color=None if color is None else color.reshape(-1, 3),

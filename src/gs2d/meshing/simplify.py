@@ -50,16 +50,16 @@ def simplify(mesh: Mesh, *, error: float = math.inf, cameras: Sequence[Camera] =
     del vertices, scale, colors
     rules = CollapseRules(max(faces, 4), error**2, LENGTH**2, TINT**2, BORDER, TURN, PULL)
     collapse(arrays, rules)
-    left = arrays.corners[arrays.corners[:, 0] >= 0]
+    remaining = arrays.corners[arrays.corners[:, 0] >= 0]
     used = np.zeros(len(mesh.vertices), bool)
-    used[left] = True
+    used[remaining] = True
     points = arrays.points[used] * size + middle
     painted = None
     if mesh.colors is not None:
         area = np.maximum(arrays.quadric[used, 10:11], np.finfo(np.float64).tiny)
         mean = np.where(area > np.finfo(np.float64).tiny, arrays.color[used, :3] / area, mesh.colors[used] / 255.0)
         painted = np.rint(np.clip(255.0 * mean, 0, 255)).astype(np.uint8)
-    return Mesh(points.astype(mesh.vertices.dtype), (np.cumsum(used) - 1)[left].astype(np.int32), painted)
+    return Mesh(points.astype(mesh.vertices.dtype), (np.cumsum(used) - 1)[remaining].astype(np.int32), painted)
 
 
 def pixel_scale(vertices: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
@@ -68,14 +68,14 @@ def pixel_scale(vertices: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     Occlusion is ignored, which errs towards more pixels. Vertices outside of all images get the median of the others,
     or 1 if there are none.
     """
-    found = np.zeros(len(vertices))
+    scale = np.zeros(len(vertices))
     for start in range(0, len(vertices), POINTS_AT_ONCE):
-        points, part = vertices[start : start + POINTS_AT_ONCE].T, found[start : start + POINTS_AT_ONCE]
+        points, part = vertices[start : start + POINTS_AT_ONCE].T, scale[start : start + POINTS_AT_ONCE]
         for camera in cameras:
             x, y, z = camera.rotation @ points + camera.T_cam_world[:3, 3:]
             z[~(z > 0)] = np.nan
             column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
             inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
             np.maximum(part, np.where(inside, math.sqrt(camera.fx * camera.fy) / z, 0), out=part)
-    seen = found > 0
-    return np.where(seen, found, np.median(found[seen]) if seen.any() else 1.0)
+    covered = scale > 0
+    return np.where(covered, scale, np.median(scale[covered]) if covered.any() else 1.0)

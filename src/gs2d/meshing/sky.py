@@ -23,7 +23,7 @@ def sky_pixels(image: np.ndarray, points: np.ndarray, above: np.ndarray, valid: 
     """Find large smooth areas without sparse points, above the horizon and at the border of an image, [H, W] bool.
 
     The image [H, W, 3] is float in [0, 1]; ``points`` [M, 2] px are projections of all sparse points; ``above`` [H, W]
-    says which rays point above the horizon. ``valid`` [H, W] are pixels with content: undistortion may leave empty
+    marks the rays that point above the horizon. ``valid`` [H, W] are pixels with content: undistortion may leave empty
     wedges, whose edges count as border.
     """
     factor = max(1, round(max(image.shape[:2]) / SIDE))

@@ -43,10 +43,10 @@ def fused_surface(
     before = 0  # number of vertices of the earlier slabs
     for start, own, stop in slabs(blocks, slab_bytes):
         volume = fuse_blocks(frames, limits, blocks.part(start, stop), backend=backend)
-        found, corners, ends = cell_surface(volume, min_weight, own - start)
-        points, tints = edge_vertices(volume, found, ends)
+        slab_edges, corners, ends = cell_surface(volume, min_weight, own - start)
+        points, tints = edge_vertices(volume, slab_edges, ends)
         del volume
-        edges.append(found + start * EDGES_OF_BLOCK)
+        edges.append(slab_edges + start * EDGES_OF_BLOCK)
         vertices.append(points)
         colors += [] if tints is None else [tints]
         faces.append(corners + before)

@@ -30,9 +30,9 @@ class Tetrahedra:
 
     def first(self) -> np.ndarray:
         """Return one tetrahedron at each point, [P + 8] int32; -1 for duplicates, which have none."""
-        found = np.full(len(self.xyz), -1, np.int32)
-        found[self.corners] = np.arange(len(self.corners), dtype=np.int32)[:, None]
-        return found
+        tetrahedra = np.full(len(self.xyz), -1, np.int32)
+        tetrahedra[self.corners] = np.arange(len(self.corners), dtype=np.int32)[:, None]
+        return tetrahedra
 
 
 def morton(cells: np.ndarray) -> np.ndarray:
@@ -105,8 +105,8 @@ def _order(cells: np.ndarray) -> np.ndarray:
 
 
 def _mirror(neighbours: np.ndarray) -> np.ndarray:
-    found = np.zeros(neighbours.shape, np.uint8)
+    facets = np.zeros(neighbours.shape, np.uint8)
     for k in range(4):
         rows = np.flatnonzero(neighbours[:, k] >= 0)
-        found[rows, k] = (neighbours[neighbours[rows, k]] == rows[:, None]).argmax(axis=1)
-    return found
+        facets[rows, k] = (neighbours[neighbours[rows, k]] == rows[:, None]).argmax(axis=1)
+    return facets

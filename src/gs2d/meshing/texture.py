@@ -210,8 +210,8 @@ def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, thr
     number of images that contribute to a texel.
     """
     texels = texels_of(atlas, size)
-    colors, seen = surface_colors(atlas.mesh, texels, images, best=best, threads=threads)
-    fill_unseen(atlas, texels, colors, seen)
+    colors, visible = surface_colors(atlas.mesh, texels, images, best=best, threads=threads)
+    fill_unseen(atlas, texels, colors, visible)
     mesh = TexturedMesh(
         vertices=atlas.mesh.vertices[atlas.source],
         normals=vertex_normals(atlas.mesh)[atlas.source],
@@ -219,7 +219,7 @@ def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, thr
         uv=atlas.uv,
         texture=spread(texels, colors),
     )
-    return Baked(mesh, len(seen), int(len(seen) - seen.sum()), atlas.charts)
+    return Baked(mesh, len(visible), int(len(visible) - visible.sum()), atlas.charts)
 
 
 def surface_colors(
@@ -231,19 +231,19 @@ def surface_colors(
     """
     origin = mesh.vertices.astype(np.float64).mean(axis=0)
     points = _Points.of(mesh, texels, origin)
-    coarse = (_Looked(mesh, image, origin) for image in images(COARSE))
-    common, samples = _compared(points, texels, float(areas(mesh).sum()), coarse)
+    coarse = (_ImageLookup(mesh, image, origin) for image in images(COARSE))
+    common, samples = _comparison_points(points, texels, float(areas(mesh).sum()), coarse)
     consensus, gains = agree(samples)
     chooser = _Chooser(points, best, threads or os.cpu_count() or 1)
     for number, image in enumerate(images(1)):
-        looked = _Looked(mesh, image, origin)
+        lookup = _ImageLookup(mesh, image, origin)
         rows = np.flatnonzero(samples[number][:, 3])
-        looked.correct(common.positions[rows], samples[number][rows], consensus[rows], gains[number])
-        chooser.add(looked)
-    colors, seen = chooser.colors()
-    if not seen.any():
+        lookup.correct(common.positions[rows], samples[number][rows], consensus[rows], gains[number])
+        chooser.add(lookup)
+    colors, visible = chooser.colors()
+    if not visible.any():
         raise ProtocolError(f"none of {len(samples)} photographs sees the mesh; does it belong to this capture?")
-    return colors, seen
+    return colors, visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,8 +272,8 @@ class _Points:
         return _Points(self.positions[rows], self.normals[rows], self.heights[rows])
 
 
-def _compared(
-    points: _Points, texels: Texels, area: float, images: Iterable[_Looked]
+def _comparison_points(
+    points: _Points, texels: Texels, area: float, images: Iterable[_ImageLookup]
 ) -> tuple[_Points, list[np.ndarray]]:
     """Return points of the comparison, and their colours and votes in each image, [P, 4] uint8.
 
@@ -288,7 +288,7 @@ def _compared(
             points = points.subset(slice(None, None, 2))
             table = [samples[::2].copy() for samples in table]
         samples = np.zeros((len(points.positions), 4), np.uint8)
-        rows, density, clear, cosine, colors = image.see(points, np.zeros(len(samples), np.float32))
+        rows, density, clear, cosine, colors = image.visible_points(points, np.zeros(len(samples), np.float32))
         resolved = np.minimum(density * area, 1)  # pixels per point
         samples[rows, :3] = np.rint(colors)
         samples[rows, 3] = np.ceil(VOTE * clear * cosine * resolved)
@@ -307,15 +307,15 @@ class _Chooser:
         self._least = np.zeros(n, np.float32)  # lowest score of each texel
         self._colors = np.zeros((n, best + 1, 3), np.uint8)
 
-    def add(self, looked: _Looked) -> None:
+    def add(self, lookup: _ImageLookup) -> None:
         """Replace the lowest score of every texel for which this image is better."""
         with ThreadPoolExecutor(self._threads) as pool:
-            for _ in pool.map(lambda part: self._choose(looked, part), self._parts):
+            for _ in pool.map(lambda part: self._choose(lookup, part), self._parts):
                 pass
 
-    def _choose(self, looked: _Looked, part: slice) -> None:
+    def _choose(self, lookup: _ImageLookup, part: slice) -> None:
         scores, least = self._scores[part], self._least[part]
-        rows, density, clear, _, colors = looked.see(self._points.subset(part), least)
+        rows, density, clear, _, colors = lookup.visible_points(self._points.subset(part), least)
         worst = scores[rows].argmin(axis=1)
         scores[rows, worst], self._colors[part][rows, worst] = density * clear, np.rint(colors)
         least[rows] = scores[rows].min(axis=1)
@@ -331,7 +331,7 @@ class _Chooser:
         return colors, self._scores.max(axis=1) > 0
 
 
-class _Looked:
+class _ImageLookup:
     """An image with its depth map of the mesh, and the distances of its pixels from outlines."""
 
     def __init__(self, mesh: Mesh, image: ColorSource, origin: np.ndarray) -> None:
@@ -356,7 +356,7 @@ class _Looked:
         column = ((np.arange(width) + 0.5) * (weights.shape[1] / width)).astype(np.int64)[None]
         self._clear *= weights[row, column]
 
-    def see(self, points: _Points, least: np.ndarray) -> tuple[np.ndarray, ...]:
+    def visible_points(self, points: _Points, least: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the visible points with a score above ``least`` [n].
 
         Returns their rows [m] int64, pixels per unit of surface (q) [m], factors for the distance from an outline (b)
@@ -381,9 +381,9 @@ class _Looked:
         cosine = facing[rows] / np.sqrt((ray * ray).sum(axis=1))
         # On a plane, depth changes by tan(incidence) footprints per pixel; the tolerance is twice that plus one.
         tolerance = z / small.fx * (1 + 2 / np.maximum(cosine, GRAZING))
-        seen = (cosine > GRAZING) & (np.abs(z - self._depth.reshape(-1)[pixel]) <= tolerance)
-        rows = rows[seen]
-        return rows, density[rows], clear[seen], cosine[seen], bilinear(self._image, x[seen], y[seen])
+        visible = (cosine > GRAZING) & (np.abs(z - self._depth.reshape(-1)[pixel]) <= tolerance)
+        rows = rows[visible]
+        return rows, density[rows], clear[visible], cosine[visible], bilinear(self._image, x[visible], y[visible])
 
     def _project(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x and y in px, and the depth."""
@@ -429,22 +429,22 @@ def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.asarray(upper * (1 - fy) + lower * fy)
 
 
-def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarray) -> None:
+def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, visible: np.ndarray) -> None:
     """Colour the texels that no image sees, in place, from adjacent surface, across charts.
 
     Vertices get the mean of the visible texels around them. Other vertices get the mean of their coloured neighbours,
     ring by ring, or the mean of all colours if their component has none. Texels interpolate the vertices of their face.
     """
-    if seen.all():
+    if visible.all():
         return
     faces, count = atlas.mesh.faces, len(atlas.mesh.vertices)
-    face, w = texels.face[seen], texels.weights[seen].astype(np.float64)
+    face, w = texels.face[visible], texels.weights[visible].astype(np.float64)
     weights = [w[:, 0], w[:, 1], 1 - w[:, 0] - w[:, 1]]
     total, valid = np.zeros((count, 3)), np.zeros(count)
     for k, weight in enumerate(weights):
         valid += np.bincount(faces[face, k], weight, count)
         for channel in range(3):
-            total[:, channel] += np.bincount(faces[face, k], weight * colors[seen, channel], count)
+            total[:, channel] += np.bincount(faces[face, k], weight * colors[visible, channel], count)
     done = valid > 1e-6
     values = np.where(done[:, None], total / np.maximum(valid, 1e-6)[:, None], 0)
     ends = faces.reshape(-1), np.roll(faces, 1, axis=1).reshape(-1)
@@ -457,8 +457,8 @@ def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarr
             break
         values[ring] = (edges @ np.where(done[:, None], values, 0))[ring] / degree[ring, None]
         done |= ring
-    values[~done] = colors[seen].mean(axis=0)
-    rows = np.flatnonzero(~seen)
+    values[~done] = colors[visible].mean(axis=0)
+    rows = np.flatnonzero(~visible)
     hidden = Texels(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
     colors[rows] = np.rint(np.clip(hidden.interpolated(values, faces), 0, 255))
 

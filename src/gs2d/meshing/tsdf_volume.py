@@ -167,12 +167,12 @@ def integrator(volumes: Sequence[Volume], device: FusionOnDevice | None) -> Iter
         return {name: None if a is None else torch.from_numpy(a).to(device.device) for name, a in arrays.items()}
 
     volumes = [volume for volume in volumes if len(volume.keys)]
-    held = [placed(_volume_arrays(volume)) for volume in volumes]
+    placed_arrays = [placed(_volume_arrays(volume)) for volume in volumes]
     colored = any(volume.color is not None for volume in volumes)
 
     def add(view: DepthSampler) -> None:
         image = placed(_view_arrays(view, colored=colored))
-        for volume, tensors in zip(volumes, held, strict=True):
+        for volume, tensors in zip(volumes, placed_arrays, strict=True):
             arrays = image | placed(_changed(volume, view)) | tensors
             arguments = arguments_of((view.height, view.width), volume.limits.truncation, arrays)
             if device is None:
@@ -182,7 +182,7 @@ def integrator(volumes: Sequence[Volume], device: FusionOnDevice | None) -> Iter
 
     yield add
     if device is not None:
-        for volume, tensors in zip(volumes, held, strict=True):
+        for volume, tensors in zip(volumes, placed_arrays, strict=True):
             for name, array in _volume_arrays(volume).items():
                 if array is not None:
                     array[...] = tensors[name].cpu().numpy()
@@ -248,8 +248,8 @@ def gather_keys(
     colored = False
     for item in frames:
         colored = colored or item.color is not None
-        found = touched(item)
-        keys = [merged(*pair) for pair in zip(keys or found, found, strict=True)]
+        blocks = touched(item)
+        keys = [merged(*pair) for pair in zip(keys or blocks, blocks, strict=True)]
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
     if not any(map(len, keys)):

@@ -39,7 +39,7 @@ from gs2d.meshing.raycast import NEAR, outlines
 OUTLINE = 2  # px on both sides of an outline that are ignored
 ENOUGH = 0.5  # fraction of a window that must be visible in both images
 SPAN = 0.03  # of the width, radius of the windows in which neighbours are compared by brightness
-FAINT = 0.02  # mean weight there, below which a neighbour says nothing
+FAINT = 0.02  # mean weight there, below which a neighbour is ignored
 TINY = 1e-12
 DARK = 0.02  # grey value below which the brightness of two images is not compared
 
@@ -182,10 +182,10 @@ def brightness_share(
     if not shares:
         return compared, compared, compared
     order = np.argsort(shares, axis=0)
-    known = np.isfinite(shares).sum(axis=0)
-    middle = np.take_along_axis(order, np.maximum(known - 1, 0)[None] // 2, axis=0)
+    valid = np.isfinite(shares).sum(axis=0)
+    middle = np.take_along_axis(order, np.maximum(valid - 1, 0)[None] // 2, axis=0)
     share, weight = (np.take_along_axis(np.stack(values), middle, axis=0)[0] for values in (shares, weights))
-    return np.where(known > 0, share, 0.0), np.where(known > 0, weight, 0.0), compared / len(shares)
+    return np.where(valid > 0, share, 0.0), np.where(valid > 0, weight, 0.0), compared / len(shares)
 
 
 def _share(
@@ -200,9 +200,9 @@ def _share(
     into = Pull.zeros(depth.shape, f"f{library.dtype.itemsize}")
     planes = match_views(view, other, depth, other_depth, settings, into, library)
     visible = planes[VISIBLE] > 0
-    seen = visible.astype(np.float64)
-    a, b = view.grey * seen, np.asarray(planes[WARPED], np.float64)
-    n, sum_a, sum_b, aa, bb = (_sums(k, settings.radius) for k in (seen, a, b, a * a, b * b))
+    visibility = visible.astype(np.float64)
+    a, b = view.grey * visibility, np.asarray(planes[WARPED], np.float64)
+    n, sum_a, sum_b, aa, bb = (_sums(k, settings.radius) for k in (visibility, a, b, a * a, b * b))
     enough = visible & (n >= ENOUGH * (2 * settings.radius + 1) ** 2)
     n = np.maximum(n, 1.0)
     mean_a, mean_b = sum_a / n, sum_b / n
