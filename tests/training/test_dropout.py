@@ -10,7 +10,7 @@ from gs2d.config.presets import two_dgs_r
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import FEW_VIEWS, Recipe, Removal
 from gs2d.render.api import rasterize
-from gs2d.training.robust.regularise import dropout_rate, dropped_out, kept_splats
+from gs2d.training.robust.regularise import dropout_rate, dropped_out, rendered_splats
 from gs2d.training.trainer import Trainer
 from train_toys import make_scene, short
 
@@ -28,13 +28,13 @@ def test_which_stages_use_dropout() -> None:
 
 def test_dropout_of_an_iteration_is_reproducible() -> None:
     recipe = dropping(0.25)
-    first = kept_splats(recipe, 0, 7, 40_000, 0.25)
-    assert torch.equal(first, kept_splats(recipe, 0, 7, 40_000, 0.25))
+    first = rendered_splats(recipe, 0, 7, 40_000, 0.25)
+    assert torch.equal(first, rendered_splats(recipe, 0, 7, 40_000, 0.25))
     assert abs(float(first.float().mean()) - 0.75) < 0.01
     for other in ((0, 8), (1, 7)):
-        both = (first & kept_splats(recipe, *other, 40_000, 0.25)).float().mean()
+        both = (first & rendered_splats(recipe, *other, 40_000, 0.25)).float().mean()
         assert abs(float(both) - 0.75**2) < 0.01  # independent
-    assert not torch.equal(first, kept_splats(replace(recipe, seed=1), 0, 7, 40_000, 0.25))
+    assert not torch.equal(first, rendered_splats(replace(recipe, seed=1), 0, 7, 40_000, 0.25))
 
 
 def test_dropped_splats_are_not_rendered_and_get_no_gradients() -> None:

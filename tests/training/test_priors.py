@@ -21,7 +21,7 @@ from gs2d.losses.prior_formulas import MetricDepth, PointDepths, RelativeDepths
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.start.initialize import initial_splats, turned_to
-from gs2d.training.start.known_points import plane_normals, with_known_points
+from gs2d.training.start.prior_points import plane_normals, with_prior_points
 from gs2d.training.trainer import Trainer
 from saved_states import resumed_everywhere
 from train_toys import SIZE, random_splats, same, short
@@ -170,7 +170,7 @@ def facing(scene: Scene, flip: tuple[int, int, int]) -> Scene:
 def test_training_starts_from_points_on_depth_maps(scene: Scene) -> None:
     made = mapped(scene, lambda _, depth: np.where(depth > 0, 3.0, 0))  # planes in front of the cameras
     recipe = replace(with_depth_prior(short(), "sensor"), init_points=120)
-    cloud, own = with_known_points(made, recipe).points, scene.points
+    cloud, own = with_prior_points(made, recipe).points, scene.points
     assert cloud is not None
     assert own is not None
     added = len(cloud) - len(own)
@@ -187,17 +187,17 @@ def test_training_starts_from_points_on_depth_maps(scene: Scene) -> None:
         assert np.allclose(pixels % 1, 0.5)  # at pixel centres, with the pixel colours
         columns, rows = np.floor(pixels).astype(int).T
         assert (colors == view.image()[rows, columns]).all()
-    again = with_known_points(made, recipe).points
+    again = with_prior_points(made, recipe).points
     assert again is not None
     assert (again.points == cloud.points).all()
-    other = with_known_points(made, replace(recipe, seed=1)).points
+    other = with_prior_points(made, replace(recipe, seed=1)).points
     assert other is not None
     assert (other.points[:9] != cloud.points[:9]).any()
 
 
 def test_splats_on_depth_maps_are_tangential_to_the_surface(scene: Scene) -> None:
     made = mapped(replace(scene, train=scene.train[:1]), lambda _, depth: np.full_like(depth, 3.0))
-    start = with_known_points(replace(made, points=None), replace(with_depth_prior(short(), "sensor"), init_points=200))
+    start = with_prior_points(replace(made, points=None), replace(with_depth_prior(short(), "sensor"), init_points=200))
     generator = torch.Generator().manual_seed(0)
     splats = initial_splats(start, sh_degree=0, random_points=5, near=0.1, generator=generator).splats
     normals = quats_to_matrices(splats.quats.double())[:, :, 2].numpy()

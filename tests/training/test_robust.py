@@ -28,8 +28,8 @@ from gs2d.training import events
 from gs2d.training.learned.point_gains import point_gains, spread
 from gs2d.training.robust.backdrop import EVEN, find_backdrop
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
+from gs2d.training.robust.large_splats import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.robustness import Robustness
-from gs2d.training.robust.seen_area import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.start.initialize import initial_splats
 from gs2d.training.start.plane_sweep import sweep_views
@@ -230,7 +230,7 @@ def test_the_largest_scale_is_a_fraction_of_the_image_at_the_nearest_camera(monk
     expected = LARGEST * angle * distance
     whole = largest_log_scales(splats, cameras)
     torch.testing.assert_close(whole.exp().squeeze(1), expected)
-    monkeypatch.setattr("gs2d.training.robust.seen_area.PAIRS", len(cameras))  # one splat at a time
+    monkeypatch.setattr("gs2d.training.robust.large_splats.PAIRS", len(cameras))  # one splat at a time
     assert torch.equal(largest_log_scales(splats, cameras), whole)
 
 

@@ -21,7 +21,7 @@ from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity, shown, shown_splats
 from gs2d.training.learned.quantity import ImagePoints
-from gs2d.training.robust.regularise import another_background, dropout_rate, dropped_out, kept_splats
+from gs2d.training.robust.regularise import another_background, dropout_rate, dropped_out, rendered_splats
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
 from gs2d.training.targets import Target, TargetSource, is_async
@@ -101,7 +101,7 @@ class FullRender:
         """Return the splats that an iteration renders."""
         rate = self.drops(stage)
         if rate > 0:
-            splats = dropped_out(splats, kept_splats(self.recipe, state.stage, iteration, len(splats), rate))
+            splats = dropped_out(splats, rendered_splats(self.recipe, state.stage, iteration, len(splats), rate))
         return self.drawn(splats)
 
     def camera(self, state: TrainState, index: int, *, learning: Collection[str] = ()) -> Camera:

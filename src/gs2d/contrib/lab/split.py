@@ -20,7 +20,7 @@ from gs2d.data import Scene
 from gs2d.errors import DataError, RunError
 from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.training.events import Notice, OnEvent, counted
-from gs2d.training.robust.seen_area import shown_weights, shrunk
+from gs2d.training.robust.large_splats import shown_weights, shrunk
 
 SIDE = 200  # px, of the renderings in which visibility is measured
 LEAST_WEIGHT = 1e-3  # px, smallest blending weight of a visible splat

@@ -41,7 +41,7 @@ def find_backdrop(scene: Scene) -> Backdrop | None:
     observed = None if scene.train[0].alpha() is not None else scene.observed()
     if observed is None:
         return None
-    found = []
+    samples = []
     for view in scene.train[:: max(1, -(-len(scene.train) // MAX_VIEWS))]:
         bare = np.ones((view.camera.height, view.camera.width), dtype=bool)
         column, row = np.floor(observed.in_view(view.name, view.camera, min_track=2).pixels).astype(np.int64).T
@@ -52,8 +52,8 @@ def find_backdrop(scene: Scene) -> Backdrop | None:
         mask = view.mask()
         if mask is not None:
             bare &= mask
-        found.append(view.target((0.0, 0.0, 0.0))[bare][::STRIDE])
-    colors = np.concatenate(found) if found else np.zeros((0, 3))
+        samples.append(view.target((0.0, 0.0, 0.0))[bare][::STRIDE])
+    colors = np.concatenate(samples) if samples else np.zeros((0, 3))
     if not len(colors):
         return None
     red, green, blue = (round(float(value), 3) for value in np.median(colors, axis=0))

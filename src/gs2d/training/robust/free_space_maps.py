@@ -37,15 +37,15 @@ class FreeView:
 
     # [H, W] world units: nearer space is free, as the image shows a surface behind it; 0 where the depth is unknown.
     limit: Tensor
-    known: Tensor  # [H, W] world units: depth of the surface that the image shows; infinite where unknown
-    nearest: Tensor  # [H, W] world units: where the depth is unknown, a depth nearer than anything known; 0 elsewhere
+    depth: Tensor  # [H, W] world units: depth of the surface that the image shows; infinite where unknown
+    nearest: Tensor  # [H, W] world units: where the depth is unknown, a depth nearer than all others; 0 elsewhere
     radius: float  # world units: radius of a ball around the camera that is expected to be empty
     project: Tensor  # [3, 4]: projects a point p to pixel (x, y) and depth z: (x z, y z, z) = project (p, 1)
     center: Tensor  # [3] world units: of the camera
 
     def to(self, device: torch.device | str) -> FreeView:
         """Return the view on a device."""
-        moved = {name: getattr(self, name).to(device) for name in ("limit", "known", "nearest", "project", "center")}
+        moved = {name: getattr(self, name).to(device) for name in ("limit", "depth", "nearest", "project", "center")}
         return replace(self, **moved)
 
 
@@ -71,14 +71,14 @@ class FreeSpaceMaps:
 
         An image speaks against a splat if it shows a surface behind it. One or two percent of the depths of each image
         are wrong, mostly at edges. So the count is 0 unless more images see through a splat than show a surface there.
-        An image without a known depth is silent, but a splat nearer than anything known, or beside a camera, has a
-        count of 1: the images decide.
+        An image without a depth there does not count. But a splat nearer than all depths of the image, or beside a
+        camera, has a count of 1, so that a trial decides.
         """
         ends = self._ends(splats)
         reach = (ends - ends[0]).norm(dim=2).amax(dim=0)
         against, silent, support, unused = torch.zeros((4, len(splats)), dtype=torch.int32, device=splats.device)
-        for kept in self._views:
-            view = kept.to(self._device)
+        for stored in self._views:
+            view = stored.to(self._device)
             _look(view, ends, reach, view.limit, 0.0, against, support)
             _look(view, ends, reach, view.nearest, view.radius, silent, unused)
         return torch.where(against > support, against, (silent > support).to(against.dtype))
@@ -94,8 +94,8 @@ class FreeSpaceMaps:
         offsets = [axes[:, :, axis] * (sign * step) for step in SAMPLES for axis in (0, 1) for sign in (-1, 1)]
         samples = torch.cat([splats.means, *(splats.means + offset for offset in offsets)])  # [P N, 3]
         count = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
-        for kept in self._views:
-            view = kept.to(self._device)
+        for stored in self._views:
+            view = stored.to(self._device)
             unused, support = torch.zeros((2, len(samples)), dtype=torch.int32, device=splats.device)
             _look(view, samples[None], samples.new_zeros(len(samples)), view.limit, 0.0, unused, support)
             count += (support.view(1 + len(offsets), len(splats)) > 0).any(dim=0)
@@ -114,18 +114,18 @@ class FreeSpaceMaps:
 
 def _free_view(sweep: Sweep, index: int) -> FreeView:
     view = sweep.views[index]
-    known = np.where(sweep.agreeing(index, AGREE) >= 1, sweep.depths[index], _UNKNOWN)
+    depth = np.where(sweep.agreeing(index, AGREE) >= 1, sweep.depths[index], _UNKNOWN)
     column, row = np.floor(view.pixels).astype(np.int64).T
-    np.minimum.at(known, (row, column), view.depth)
+    np.minimum.at(depth, (row, column), view.depth)
     half = WINDOW // 2
-    grown = -F.max_pool2d(-torch.from_numpy(known)[None, None], WINDOW, 1, half)[0, 0]
+    grown = -F.max_pool2d(-torch.from_numpy(depth)[None, None], WINDOW, 1, half)[0, 0]
     unknown = ~torch.isfinite(grown)
     limit = torch.where(unknown, 0.0, NEARER * grown)
     nearest = torch.where(unknown, NEARER * FLOOR * view.nearest, 0.0)
     K, T = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in (view.K, view.T))
     places = K @ T[:3], -T[:3, :3].T @ T[:3, 3]
     radius = BALL * FLOOR * view.nearest
-    return FreeView(limit.float(), torch.from_numpy(known).float(), nearest.float(), radius, *places)
+    return FreeView(limit.float(), torch.from_numpy(depth).float(), nearest.float(), radius, *places)
 
 
 def _look(
@@ -147,12 +147,12 @@ def look_at_free_space(
     if library is None or library.dtype != torch.float32:
         return False
     tensors = {"ends": ends, "reach": reach, "project": view.project, "center": view.center}
-    tensors |= {"limit": limit, "known": view.known}
-    given = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    tensors |= {"limit": limit, "known": view.depth}
+    arrays = {name: tensor.contiguous() for name, tensor in tensors.items()}
     height, width = limit.shape
     sizes = {"count": ends.shape[1], "places": len(ends), "height": height, "width": width}
     limits = {"radius": radius, "fraction": 1 - NEARER}
-    library.call("gs2d_free_space", **sizes, **limits, **given, against=against, support=support)
+    library.call("gs2d_free_space", **sizes, **limits, **arrays, against=against, support=support)
     return True
 
 
@@ -166,20 +166,20 @@ def look_at_free_space_reference(
     """
     free = (ends[0] - view.center).norm(dim=1) < radius
     for places in ends:
-        z, inside, row, column = _seen(view, places)
+        z, inside, row, column = _projected(view, places)
         free |= inside & (z < limit[row, column])
     against += free
-    z, inside, row, column = _seen(view, ends[0])
-    known = view.known[row, column]
-    support += inside & torch.isfinite(known) & ((z - known).abs() <= (1 - NEARER) * known)
+    z, inside, row, column = _projected(view, ends[0])
+    depth = view.depth[row, column]
+    support += inside & torch.isfinite(depth) & ((z - depth).abs() <= (1 - NEARER) * depth)
 
 
-def _seen(view: FreeView, places: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _projected(view: FreeView, places: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the depth of points [N, 3] in an image, whether they are inside, and their clipped rows and columns."""
-    seen = places @ view.project[:, :3].T + view.project[:, 3]  # (x z, y z, z)
-    z = seen[:, 2]
+    projected = places @ view.project[:, :3].T + view.project[:, 3]  # (x z, y z, z)
+    z = projected[:, 2]
     front = z.clamp_min(1e-12)
-    x, y = seen[:, 0] / front, seen[:, 1] / front
+    x, y = projected[:, 0] / front, projected[:, 1] / front
     height, width = view.limit.shape
     inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     column = torch.nan_to_num(x, nan=0.0).clamp(0, width - 1).long()

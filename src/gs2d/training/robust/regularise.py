@@ -33,7 +33,7 @@ def dropout_rate(recipe: Recipe, stage: Stage, views: int) -> float:
     return recipe.removal.dropout if recipe.removal is not None and _trains_shape(stage) and views <= FEW_VIEWS else 0.0
 
 
-def kept_splats(recipe: Recipe, stage: int, iteration: int, count: int, rate: float) -> Tensor:
+def rendered_splats(recipe: Recipe, stage: int, iteration: int, count: int, rate: float) -> Tensor:
     """Return which of ``count`` splats an iteration (from 1) of a stage renders, [N] bool in host memory.
 
     The result depends only on the arguments, so that repeated iterations and all processes agree.
@@ -42,13 +42,13 @@ def kept_splats(recipe: Recipe, stage: int, iteration: int, count: int, rate: fl
     return torch.from_numpy(generator.random(count, dtype=np.float32) >= rate)
 
 
-def dropped_out(splats: Splats, kept: Tensor) -> Splats:
-    """Return the splats [N], of which only ``kept`` [N] bool are rendered and have gradients.
+def dropped_out(splats: Splats, rendered: Tensor) -> Splats:
+    """Return the splats [N], of which only ``rendered`` [N] bool are drawn and have gradients.
 
-    The opacity of the kept ones does not change: compensation gave worse results (docs/notebook/floaters.md).
+    Their opacity does not change: compensation gave worse results (docs/notebook/floaters.md).
     """
     logits = splats.opacity_logits
-    logits = torch.where(kept.to(logits.device), logits, logits.new_full((), NOT_DRAWN))
+    logits = torch.where(rendered.to(logits.device), logits, logits.new_full((), NOT_DRAWN))
     return Splats(**{**dict(splats.items()), "opacity_logits": logits})
 
 

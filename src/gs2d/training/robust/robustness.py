@@ -28,15 +28,15 @@ from gs2d.training.parallel import ONE_PROCESS, ProcessGroup
 from gs2d.training.robust import shine
 from gs2d.training.robust.backdrop import in_color
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
+from gs2d.training.robust.large_splats import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.regularise import is_opaque
-from gs2d.training.robust.seen_area import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.rows import keep_rows
 from gs2d.training.start.background_sphere import sphere_points
 from gs2d.training.start.camera_adjustment import adjust_cameras
 from gs2d.training.start.initialize import initial_splats, splats_as_start
-from gs2d.training.start.known_points import with_known_points
 from gs2d.training.start.plane_sweep import SmallView, Sweep, sweep_views
+from gs2d.training.start.prior_points import with_prior_points
 from gs2d.training.start.start_fit import fit_start
 from gs2d.training.start.start_points import start_points
 from gs2d.training.state import TrainState
@@ -53,7 +53,7 @@ MISSED = "missed"  # row group of the splats that a trial found to be needed
 
 
 def check_free_space(scene: Scene, recipe: Recipe) -> None:
-    """Raise DataError if floaters are to be removed, and no sparse points tell where space is free."""
+    """Raise DataError if the recipe removes floaters, but the scene has no sparse points to determine free space."""
     if recipe.removal is not None and scene.observed() is None:
         raise DataError(
             f"{scene.name} must have sparse points and the images that show them to remove floaters (COLMAP has both), "
@@ -84,7 +84,7 @@ class Robustness:
 
     The constructor raises DataError if floaters are to be removed and the capture lacks sparse points and the images
     that show them, or if a required dense start finds nothing. ``scene`` has the points that training starts from;
-    ``lacks`` is the reason if an optional dense start failed, else empty.
+    ``start_failure`` is the reason if an optional dense start failed, else empty.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Robustness:
         self._images: Sequence[SmallView] = ()
         self._neighbours: Sequence[Sequence[int]] = ()
         self._sweep: Sweep | None = None  # kept until the first splats are fitted
-        self.lacks = ""
+        self.start_failure = ""
         if (recipe.dense_start is None and recipe.removal is None) or not processes.leads:
             return
         check_free_space(scene, recipe)
@@ -118,7 +118,7 @@ class Robustness:
         except DataError as error:
             if start is None or start.required or recipe.removal is not None:
                 raise
-            self.lacks = str(error).partition("; ")[0]  # without the advice
+            self.start_failure = str(error).partition("; ")[0]  # without the advice
             return
         self._sweep = sweep if start is not None and start.fit else None
         if recipe.removal is not None:
@@ -139,9 +139,9 @@ class Robustness:
         start finds enough others. ``within``: returns which points [M, 3] belong to the trained part of the scene, [M]
         bool.
         """
-        recipe, dense = self._recipe, self._recipe.dense_start is not None and not self.lacks
+        recipe, dense = self._recipe, self._recipe.dense_start is not None and not self.start_failure
         if init is None or dense:
-            start = with_known_points(self.scene, recipe)
+            start = with_prior_points(self.scene, recipe)
             initial = initial_splats(
                 start,
                 sh_degree=recipe.sh_degree,
@@ -156,7 +156,7 @@ class Robustness:
             splats = initial.splats if sweep is None else fit_start(initial.splats, sweep, initial.sized)
             splats = splats if within is None else splats.rows(within(splats.means))
             if init is None or len(splats) >= MIN_START:
-                return splats, events.Initialised(len(splats), source, initial.dropped, self.lacks)
+                return splats, events.Initialised(len(splats), source, initial.dropped, self.start_failure)
         splats = splats_as_start(init, sh_degree=recipe.sh_degree, dtype=dtype)
         return splats, events.Initialised(len(splats), "splats", 0)
 
@@ -184,14 +184,14 @@ class Robustness:
         if LIMITED_FROM * stage.iterations <= iteration < stage.iterations:
             self._limit_scales(state)
         nobody = torch.zeros(state.splats.means.shape[0], dtype=torch.bool, device=state.splats.device)
-        known = nobody if _ends_part(stage, iteration) else state.groups.get(MISSED, nobody)
-        verdict = self._processes.decide(lambda: self._tried(state, stage, iteration, known), known)
-        guilty = verdict == REMOVED
-        state.groups[MISSED] = known | (verdict == NEEDED)
-        removed = int(guilty.sum())
+        spared = nobody if _ends_part(stage, iteration) else state.groups.get(MISSED, nobody)
+        verdict = self._processes.decide(lambda: self._tried(state, stage, iteration, spared), spared)
+        floaters = verdict == REMOVED
+        state.groups[MISSED] = spared | (verdict == NEEDED)
+        removed = int(floaters.sum())
         if removed == 0 or removed == len(state.splats):  # all: the images contradict each other
             return []
-        keep_rows(state, ~guilty)
+        keep_rows(state, ~floaters)
         return [events.FloatersRemoved(stage.name, iteration, removed, len(state.splats))]
 
     @torch.no_grad()
@@ -210,11 +210,11 @@ class Robustness:
         self._backend.assign(scales, torch.minimum(scales, limits))
 
     def find_shine(self, state: TrainState, stage: Stage, iteration: int) -> None:
-        """Find out where photographs show shiny surface, if due; without the native library they count as matt."""
+        """Detect shiny surfaces in the images, if due; without the native library all count as matt."""
         if not self._looks_for_shine(stage, iteration):
             return
-        found = torch.zeros((len(self.scene.train), shine.CELLS, shine.CELLS), dtype=torch.uint8)
-        state.shine = self._processes.decide(partial(self._shine, state, found), found.to(state.splats.device))
+        matt = torch.zeros((len(self.scene.train), shine.CELLS, shine.CELLS), dtype=torch.uint8)
+        state.shine = self._processes.decide(partial(self._shine, state, matt), matt.to(state.splats.device))
 
     def _looks_for_shine(self, stage: Stage, iteration: int) -> bool:
         return self._recipe.removal is not None and shine.is_due(stage, iteration)

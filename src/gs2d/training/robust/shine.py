@@ -1,4 +1,4 @@
-"""Find shiny surface: brightness that changes with the direction of view.
+"""Find shiny surfaces, whose brightness changes with the viewing direction.
 
 Reflections are texture that is not on the surface, so colours mislead the geometry below them as much as where there is
 no texture. For pairs of neighbouring photographs, warped by the rendered depth, u is the share of brightness in their
@@ -38,7 +38,7 @@ WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are made ane
 CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny things have matt-looking spots
 TINY = 1e-12
 WORKERS = 4  # threads; those of the library come on top
-LEAST = 0.05  # mean weight below which a cell is matt: no texture, which flatness tells
+LEAST = 0.05  # mean weight below which a cell is matt: no texture, which flatness handles
 
 
 def is_due(stage: Stage, iteration: int) -> bool:
@@ -47,7 +47,7 @@ def is_due(stage: Stage, iteration: int) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _RenderedView:
     """A photograph, usable away from outlines, and the rendered depth [H, W] world units, 0 without a surface."""
 
     image: GreyImage
@@ -70,29 +70,29 @@ def shine_maps(
     """
     settings = settings.for_depths("transmittance")
 
-    def drawn(index: int) -> _Seen:
+    def drawn(index: int) -> _RenderedView:
         image = image_at(index)
         output = rasterize(splats, image.camera, settings, backend=backend)
         depth = torch.where(output.alpha > 0.5, output.depth("transmittance"), 0.0).cpu().numpy()
         inner = DrawnMesh(np.zeros(0, np.int32), depth).inner(image.camera.fx)
-        return _Seen(replace(image, usable=inner if image.usable is None else inner & image.usable), depth)
+        return _RenderedView(replace(image, usable=inner if image.usable is None else inner & image.usable), depth)
 
     # All views that are compared, in memory: at most 120 and their neighbours, downscaled.
     compared = {index: others for index, others in enumerate(neighbours) if others}
-    seen = {index: drawn(index) for index in sorted({*compared, *(one for others in neighbours for one in others)})}
+    views = {index: drawn(index) for index in sorted({*compared, *(one for others in neighbours for one in others)})}
     maps, confirmed = np.zeros((2, len(neighbours), CELLS, CELLS))
     with ThreadPoolExecutor(min(WORKERS, torch.get_num_threads())) as pool:
-        beside = ([seen[other] for other in others] for others in compared.values())
-        found = pool.map(partial(_shine, library=library), map(seen.__getitem__, compared), beside)
-        for index, shine in zip(compared, found, strict=True):
+        beside = ([views[other] for other in others] for others in compared.values())
+        results = pool.map(partial(_shine, library=library), map(views.__getitem__, compared), beside)
+        for index, shine in zip(compared, results, strict=True):
             maps[index] = shine
     for index, others in compared.items():
-        there = _shown_by(seen[index], [(seen[other].image.camera, maps[other]) for other in others])
+        there = _shown_by(views[index], [(views[other].image.camera, maps[other]) for other in others])
         confirmed[index] = np.minimum(maps[index], there)
     return torch.from_numpy(np.rint(255 * confirmed).astype(np.uint8))
 
 
-def _shine(view: _Seen, beside: Sequence[_Seen], library: Library) -> np.ndarray:
+def _shine(view: _RenderedView, beside: Sequence[_RenderedView], library: Library) -> np.ndarray:
     """Return how shiny the surface is in the cells of a photograph, from 0 to 1."""
     pairs = [(other.image, other.depth) for other in beside]
     share, weight, compared = brightness_share(view.image, view.depth, pairs, MatchSettings(), library)
@@ -105,7 +105,7 @@ def _shine(view: _Seen, beside: Sequence[_Seen], library: Library) -> np.ndarray
     return np.where(textured > LEAST, shiny, 0.0)
 
 
-def _shown_by(view: _Seen, maps: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
+def _shown_by(view: _RenderedView, maps: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
     """Return the lower median of other maps at the surface that the cells of a photograph show."""
     camera, centres = view.image.camera, (np.arange(CELLS) + 0.5) / CELLS
     rows, columns = (np.floor(centres * side).astype(int) for side in view.depth.shape)

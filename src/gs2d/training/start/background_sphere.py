@@ -37,15 +37,15 @@ def sphere_points(scene: Scene, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, n
     sweep : Sweep
         Downscaled images of the scene, and their depth maps.
     """
-    looked_at = range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS)))
-    reach = reach_of(scene, _swept_places(sweep, looked_at))
+    sampled = range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS)))
+    reach = reach_of(scene, _swept_places(sweep, sampled))
     if reach is None or scene.train[0].alpha() is not None:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     radius, directions = RADIUS * reach.radius, evenly_on_sphere(SPLATS)
-    rows, colors = _looks(sweep, looked_at, reach.center + radius * directions)
-    kept, median = _medians(rows, colors)
+    rows, colors = _observations(sweep, sampled, reach.center + radius * directions)
+    visible, median = _medians(rows, colors)
     size = SIZE * math.sqrt(4 * math.pi / SPLATS) * radius
-    return reach.center + radius * directions[kept], median, -directions[kept], np.full(len(kept), size)
+    return reach.center + radius * directions[visible], median, -directions[visible], np.full(len(visible), size)
 
 
 def evenly_on_sphere(count: int) -> np.ndarray:
@@ -57,39 +57,39 @@ def evenly_on_sphere(count: int) -> np.ndarray:
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
 
 
-def _swept_places(sweep: Sweep, looked_at: Sequence[int]) -> np.ndarray:
-    """Return some of the swept points [P, 3]."""
-    found = [np.zeros((0, 3))]
-    for index in looked_at:
+def _swept_places(sweep: Sweep, sampled: Sequence[int]) -> np.ndarray:
+    """Return a subset of the swept points [P, 3]."""
+    swept = [np.zeros((0, 3))]
+    for index in sampled:
         depth = sweep.depths[index]
-        places, known = unproject(sweep.views[index], depth)[::STRIDE, ::STRIDE], (depth > 0)[::STRIDE, ::STRIDE]
-        found.append(places[known])
-    return np.concatenate(found)
+        places, valid = unproject(sweep.views[index], depth)[::STRIDE, ::STRIDE], (depth > 0)[::STRIDE, ::STRIDE]
+        swept.append(places[valid])
+    return np.concatenate(swept)
 
 
 def _unknown(sweep: Sweep, index: int) -> np.ndarray:
     """Return the pixels [H, W] of a downscaled image with unknown depth."""
-    known = binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
-    return np.asarray(sweep.views[index].usable & ~known)
+    covered = binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
+    return np.asarray(sweep.views[index].usable & ~covered)
 
 
-def _looks(sweep: Sweep, looked_at: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _observations(sweep: Sweep, sampled: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows [L] of points [N, 3] that images show in pixels of unknown depth, and their colours [L, 3]."""
     rows, colors = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
-    for index in looked_at:
+    for index in sampled:
         view = sweep.views[index]
         unknown = _unknown(sweep, index)
         _, column, row, inside = project(view, places)
-        shown = np.flatnonzero(inside)
-        shown = shown[unknown[row[shown], column[shown]]]
-        rows.append(shown)
-        colors.append(view.color[:, row[shown], column[shown]].numpy().T.astype(np.float64))
+        visible = np.flatnonzero(inside)
+        visible = visible[unknown[row[visible], column[visible]]]
+        rows.append(visible)
+        colors.append(view.color[:, row[visible], column[visible]].numpy().T.astype(np.float64))
     return np.concatenate(rows), np.concatenate(colors)
 
 
 def _medians(rows: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct rows [P] among [L], ascending, and the median colour of each [P, 3]."""
     order = np.argsort(rows, kind="stable")
-    kept, first = np.unique(rows[order], return_index=True)
-    groups = np.split(colors[order], first[1:]) if len(kept) else []
-    return kept, np.array([np.median(group, axis=0) for group in groups]).reshape(-1, 3)
+    distinct, first = np.unique(rows[order], return_index=True)
+    groups = np.split(colors[order], first[1:]) if len(distinct) else []
+    return distinct, np.array([np.median(group, axis=0) for group in groups]).reshape(-1, 3)

@@ -1,7 +1,7 @@
 """Cameras adjusted before training, so that depth maps of a plane sweep agree (docs/math.md, "Adjusted cameras").
 
-Structure from motion and the trackers of phones know a camera by some hundred points. Where they are off by half a
-pixel, depth maps of different pairs of photographs lie side by side, and training blurs what it should resolve. The
+Structure from motion and phone trackers estimate a camera from a few hundred points. Where they are off by half a
+pixel, depth maps of different image pairs do not coincide, and training blurs details. The
 swept depth maps match thousands of pixels, which a bundle adjustment turns into better poses.
 """
 
@@ -33,7 +33,7 @@ ROUNDS = 4  # of sweep and adjustment; one is enough for errors up to a pixel of
 TURNS, STEPS = 3, 4  # times that patches are matched again, and Gauss-Newton steps for each
 DOUBT = 4.0  # standard deviations of a match at which its weight is halved
 INDEPENDENT = 1 / 400  # share of the matches: neighbouring pixels, and pixels on the same highlight, err together
-EXPECTED = 0.5  # px of downscaled images: standard deviation of the errors of the given cameras
+EXPECTED = 0.5  # px of downscaled images: standard deviation of the errors of the initial cameras
 GAIN = 0.9  # adjusted cameras are used if the median error across epipolar lines falls below this factor
 
 
@@ -58,7 +58,7 @@ class _Pixels:
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """Pixels of a view that were found in another one.
+    """Pixels of a view matched in another one.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class _Matches:
     rows : ndarray [m] int
         Which of the pixels.
     places : ndarray [m, 2] px
-        Where they are in the other view.
+        Positions in the other view.
     information : ndarray [m, 2, 2]
         Inverse covariance of the places.
     """
@@ -95,31 +95,31 @@ def adjust_cameras(scene: Scene, settings: DenseStart) -> tuple[Scene, Sweep | N
 
 
 def adjusted_poses(sweep: Sweep) -> np.ndarray | None:
-    """Return T_cam_world [V, 4, 4] at which the photographs match best; None if the given poses do as well."""
+    """Return T_cam_world [V, 4, 4] at which the images match best; None if the initial poses match as well."""
     poses = np.stack([view.T for view in sweep.views]).astype(np.float64)
-    given = poses.copy()
+    initial = poses.copy()
     pixels = [_pixels(sweep, index) for index in range(len(poses))]
     before = None
     for _ in range(TURNS):
         matches = [_matched(sweep, index, pixels[index], poses) for index in range(len(poses))]
         before = _across(sweep.views, pixels, matches, poses) if before is None else before
         for _ in range(STEPS):
-            _step(sweep.views, pixels, matches, poses, given)
+            _step(sweep.views, pixels, matches, poses, initial)
         if not _across(sweep.views, pixels, matches, poses) < GAIN * before:
             return None
     return poses
 
 
 def _pixels(sweep: Sweep, index: int) -> _Pixels:
-    """Choose the pixels of a view that are matched: of known depth, with texture, spread over the image."""
+    """Choose the pixels of a view to match: with consistent depth and texture, spread over the image."""
     view, depth = sweep.views[index], sweep.depths[index]
-    worth = np.zeros(depth.shape)
+    score = np.zeros(depth.shape)
     inner = (slice(RADIUS, -RADIUS),) * 2
     if sweep.neighbours[index] and min(depth.shape) > max(2 * RADIUS, CELL):
         texture = F.avg_pool2d(_gradients(view)[:, 1:].square().sum(dim=1, keepdim=True), 2 * RADIUS + 1, 1)
-        worth[inner] = np.where(sweep.known(index)[inner], texture[0, 0].numpy(), 0)
+        score[inner] = np.where(sweep.consistent(index)[inner], texture[0, 0].numpy(), 0)
     height, width = view.size[0] // CELL, view.size[1] // CELL
-    squares = worth[: height * CELL, : width * CELL].reshape(height, CELL, width, CELL)
+    squares = score[: height * CELL, : width * CELL].reshape(height, CELL, width, CELL)
     cells = squares.transpose(0, 2, 1, 3).reshape(height, width, CELL * CELL)
     y, x = np.nonzero(cells.max(axis=2, initial=0) > TEXTURE)
     within = cells[y, x].argmax(axis=1)
@@ -138,11 +138,11 @@ def _gradients(view: SmallView) -> torch.Tensor:
 
 
 def _matched(sweep: Sweep, index: int, pixels: _Pixels, poses: np.ndarray) -> list[_Matches]:
-    """Find the patches around pixels of a view in its neighbours: one step of Lucas and Kanade from the prediction.
+    """Match patches around pixels of a view in its neighbours: one step of Lucas and Kanade from the prediction.
 
     Patches are compared at zero mean and equal variance, so exposure does not matter.
     """
-    view, found = sweep.views[index], []
+    view, matches = sweep.views[index], []
     near = np.arange(-RADIUS, RADIUS + 1)
     columns = (pixels.at[:, :1] + np.tile(near, len(near))).clip(0, view.size[1] - 1)  # [M, K]
     rows = (pixels.at[:, 1:] + np.repeat(near, len(near))).clip(0, view.size[0] - 1)
@@ -151,15 +151,15 @@ def _matched(sweep: Sweep, index: int, pixels: _Pixels, poses: np.ndarray) -> li
     spread = own.std(axis=1) + NOISE
     centres = np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)], axis=-1)
     for other in sweep.neighbours[index] if len(own) else ():
-        seen = sweep.views[other]
+        target = sweep.views[other]
         motion = poses[other] @ np.linalg.inv(poses[index])
-        turned = centres @ (seen.K @ motion[:3, :3] @ np.linalg.inv(view.K)).T
-        turned += (seen.K @ motion[:3, 3]) * pixels.inverse[:, None, None]
+        turned = centres @ (target.K @ motion[:3, :3] @ np.linalg.inv(view.K)).T
+        turned += (target.K @ motion[:3, 3]) * pixels.inverse[:, None, None]
         at = turned[..., :2] / np.maximum(turned[..., 2:], 1e-9)  # [M, K, 2]
-        size = np.array(seen.size[::-1])
+        size = np.array(target.size[::-1])
         usable = ((turned[..., 2:] > 0) & (at > 1) & (at < size - 1)).all(axis=(1, 2))
         grid = torch.from_numpy(2 * at / size - 1).float()[None]
-        there = F.grid_sample(_gradients(seen), grid, align_corners=False, padding_mode="border")[0].double().numpy()
+        there = F.grid_sample(_gradients(target), grid, align_corners=False, padding_mode="border")[0].double().numpy()
         there -= there.mean(axis=2, keepdims=True)
         scale = there[0].std(axis=1) + NOISE
         usable &= (own * there[0]).mean(axis=1) / (spread * scale) > MIN_NCC
@@ -170,8 +170,8 @@ def _matched(sweep: Sweep, index: int, pixels: _Pixels, poses: np.ndarray) -> li
         noise = (rest - np.einsum("mka,ma->mk", slope, shift)).var(axis=1) + NOISE**2
         which = np.flatnonzero(usable & (np.abs(shift) < FARTHEST).all(axis=1))
         places = at[which, len(near) ** 2 // 2] + shift[which]
-        found.append(_Matches(other, which, places, products[which] / noise[which, None, None]))
-    return found
+        matches.append(_Matches(other, which, places, products[which] / noise[which, None, None]))
+    return matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,19 +184,19 @@ class _Linear:
     by_inverse: np.ndarray  # [m, 2] inverse depth
 
 
-def _linear(seen: SmallView, pixels: _Pixels, index: int, match: _Matches, poses: np.ndarray) -> _Linear:
+def _linear(target: SmallView, pixels: _Pixels, index: int, match: _Matches, poses: np.ndarray) -> _Linear:
     """Linearise the predictions of matches at the current poses and depths."""
     own = pixels.rays[match.rows] / pixels.inverse[match.rows, None]
     motion = poses[match.other] @ np.linalg.inv(poses[index])
     there = own @ motion[:3, :3].T + motion[:3, 3]
-    z, focal = np.maximum(there[:, 2:], 1e-9), np.diag(seen.K)[:2]
+    z, focal = np.maximum(there[:, 2:], 1e-9), np.diag(target.K)[:2]
     flat = there[:, :2] / z
     by_point = np.zeros((len(own), 2, 3))
     by_point[:, (0, 1), (0, 1)] = focal / z
     by_point[:, :, 2] = -focal * flat / z
     back = by_point @ motion[:3, :3]
     by_inverse = np.einsum("mab,mb->ma", back, -own / pixels.inverse[match.rows, None])
-    errors = match.places - (flat * focal + seen.K[:2, 2])
+    errors = match.places - (flat * focal + target.K[:2, 2])
     return _Linear(errors, -back @ _moved(own), by_point @ _moved(there), by_inverse)
 
 
@@ -214,13 +214,13 @@ def _across(
     views: Sequence[SmallView], pixels: Sequence[_Pixels], matches: Sequence[list[_Matches]], poses: np.ndarray
 ) -> float:
     """Return the median error across epipolar lines, px: depth cannot explain it."""
-    found = [np.zeros(0)]
+    parts = [np.zeros(0)]
     for index, some in enumerate(matches):
         for match in some:
             linear = _linear(views[match.other], pixels[index], index, match, poses)
             line = linear.by_inverse / np.maximum(np.linalg.norm(linear.by_inverse, axis=1, keepdims=True), 1e-12)
-            found.append(np.abs(linear.errors[:, 0] * line[:, 1] - linear.errors[:, 1] * line[:, 0]))
-    errors = np.concatenate(found)
+            parts.append(np.abs(linear.errors[:, 0] * line[:, 1] - linear.errors[:, 1] * line[:, 0]))
+    errors = np.concatenate(parts)
     return float(np.median(errors)) if len(errors) else 0.0
 
 
@@ -229,7 +229,7 @@ def _step(
     pixels: Sequence[_Pixels],
     matches: Sequence[list[_Matches]],
     poses: np.ndarray,
-    given: np.ndarray,
+    initial: np.ndarray,
 ) -> None:
     """Do a Gauss-Newton step for poses and depths, in place.
 
@@ -255,8 +255,8 @@ def _step(
             heavy = np.einsum("mab,mb->ma", weights, linear.by_inverse)
             own[match.rows] += (linear.by_inverse * heavy).sum(axis=1)
             force[match.rows] += (linear.errors * heavy).sum(axis=1)
-        known = own > 0
-        inverse = np.where(known, 1 / np.where(known, own, 1), 0)
+        constrained = own > 0
+        inverse = np.where(constrained, 1 / np.where(constrained, own, 1), 0)
         normal -= mixed.T @ (mixed * inverse[:, None])
         push -= mixed.T @ (inverse * force)
         at = (6 * np.array(cameras)[:, None] + np.arange(6)).reshape(-1)
@@ -266,7 +266,7 @@ def _step(
     focal = np.array([view.K[0, 0] for view in views])
     middle = np.array([np.median(own.inverse) if len(own.inverse) else 1.0 for own in pixels])
     stiff = (focal / EXPECTED)[:, None] * np.stack([np.ones_like(middle)] * 3 + [middle] * 3, axis=1)
-    moved = poses @ np.linalg.inv(given)
+    moved = poses @ np.linalg.inv(initial)
     turns = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
     right -= stiff**2 * np.concatenate([turns, moved[:, :3, 3]], axis=1)
     rows, columns, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))

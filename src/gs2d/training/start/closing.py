@@ -1,6 +1,6 @@
-"""Points where a plane sweep found none: a minimum cut closes the gaps between swept points.
+"""Points in gaps of the plane sweep: a minimum cut closes the gaps between swept points.
 
-On bare walls, ceilings and table tops, photographs do not match. Lines of sight to the swept points tell which
+On bare walls, ceilings and table tops, images do not match. Lines of sight to the swept points determine which
 tetrahedra between the points are free, and the cut closes the rest with little area: a rim becomes a ceiling. The
 result is a guess, so a point is used where no view sees through it and, in wide gaps, where views show it without
 texture. Formulas: docs/math.md, "Dense start".
@@ -35,7 +35,7 @@ def gap_points(
     apart.
     """
     depths = {
-        index: np.where(sweep.known(index), sweep.depths[index], 0)
+        index: np.where(sweep.consistent(index), sweep.depths[index], 0)
         for index in range(len(sweep.views))
         if sweep.neighbours[index]
     }
@@ -48,8 +48,8 @@ def gap_points(
     samples, which = _spread(corners[crossing], spacing[faces[crossing]].max(axis=1))
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[crossing]
     normals = (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))[which]
-    kept, colors = _believed(sweep, depths, centers, samples, normals, (edges[crossing] <= NARROW)[which])
-    return samples[kept], colors[kept], normals[kept], pixel[faces[crossing]].mean(axis=1)[which][kept]
+    valid, colors = _supported(sweep, depths, centers, samples, normals, (edges[crossing] <= NARROW)[which])
+    return samples[valid], colors[valid], normals[valid], pixel[faces[crossing]].mean(axis=1)[which][valid]
 
 
 def _facets(
@@ -90,7 +90,7 @@ def _spread(corners: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.nd
     return (1 - root) * a + root * (1 - v) * b + root * v * c, which
 
 
-def _believed(
+def _supported(
     sweep: Sweep,
     depths: Mapping[int, np.ndarray],
     centers: np.ndarray,
@@ -98,7 +98,7 @@ def _believed(
     normals: np.ndarray,
     narrow: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which points most views see in bare pixels while none sees through them, and their mean colours there.
+    """Return which points most views show in bare pixels and no view sees through, and their mean colours there.
 
     A view sees a point that faces it if its own depth there is unknown or the same. In ``narrow`` gaps [M], pixels may
     have texture.

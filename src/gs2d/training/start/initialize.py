@@ -79,25 +79,25 @@ def initial_splats(
         points = scene.bounds[0] + unit * (scene.bounds[1] - scene.bounds[0])
         colors, source = np.full((random_points, 3), 0.5), "random"
     usable = usable_points(points, scene, near)
-    kept = points[usable]
-    if len(kept) < 2:
+    means = points[usable]
+    if len(means) < 2:
         raise _no_points(points, scene, near)
     floor = min(SCALE_FLOOR, RELATIVE_SCALE_FLOOR * scene.extent)
-    scales = nearest_distances(kept, k=3)
-    known = np.zeros(len(kept)) if cloud is None or cloud.sizes is None else cloud.sizes[usable]
-    scales = np.maximum(np.where(known > 0, known, scales), floor)
-    quats = random_rotations(len(kept), generator)
+    scales = nearest_distances(means, k=3)
+    sizes = np.zeros(len(means)) if cloud is None or cloud.sizes is None else cloud.sizes[usable]
+    scales = np.maximum(np.where(sizes > 0, sizes, scales), floor)
+    quats = random_rotations(len(means), generator)
     if cloud is not None and cloud.normals is not None:
         quats = turned_to(torch.as_tensor(cloud.normals[usable], dtype=torch.float64), quats)
     splats = Splats(
-        means=torch.as_tensor(kept).to(dtype),
+        means=torch.as_tensor(means).to(dtype),
         quats=quats.to(dtype),
         log_scales=torch.as_tensor(np.log(scales)).to(dtype)[:, None].repeat(1, 2),
-        opacity_logits=torch.full((len(kept),), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), dtype=dtype),
+        opacity_logits=torch.full((len(means),), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), dtype=dtype),
         sh0=rgb_to_sh0(torch.as_tensor(colors[usable]).to(dtype)),
-        shN=torch.zeros(len(kept), num_coefficients(sh_degree) - 1, 3, dtype=dtype),
+        shN=torch.zeros(len(means), num_coefficients(sh_degree) - 1, 3, dtype=dtype),
     )
-    return Initial(splats, source, len(points) - len(kept), torch.from_numpy(known > 0))
+    return Initial(splats, source, len(points) - len(means), torch.from_numpy(sizes > 0))
 
 
 def splats_as_start(splats: Splats, *, sh_degree: int, dtype: torch.dtype = torch.float32) -> Splats:
@@ -113,10 +113,10 @@ def splats_as_start(splats: Splats, *, sh_degree: int, dtype: torch.dtype = torc
     for name, tensor in splats.items():
         if not bool(torch.isfinite(tensor).all()):
             raise DataError(f"splats to start from must be finite, got NaN or infinity in their {name}")
-    held, wanted = splats.shN.shape[1], num_coefficients(sh_degree) - 1
-    rest = splats.shN[:, :wanted]
-    if held < wanted:
-        rest = torch.cat([rest, rest.new_zeros(len(splats), wanted - held, 3)], dim=1)
+    available, needed = splats.shN.shape[1], num_coefficients(sh_degree) - 1
+    rest = splats.shN[:, :needed]
+    if available < needed:
+        rest = torch.cat([rest, rest.new_zeros(len(splats), needed - available, 3)], dim=1)
     parts = dict(splats.items()) | {"shN": rest}
     return Splats(**{name: tensor.detach().to("cpu", dtype, copy=True).contiguous() for name, tensor in parts.items()})
 
@@ -136,12 +136,12 @@ def usable_points(points: np.ndarray, scene: Scene, near: float) -> np.ndarray:
     """
     finite = np.isfinite(points).all(axis=1)
     safe = np.where(finite[:, None], points, 0.0)
-    seen = np.zeros(len(points), dtype=bool)
+    visible = np.zeros(len(points), dtype=bool)
     too_close = np.zeros(len(points), dtype=bool)
     for view in scene.train:
-        seen |= view.camera.project(safe)[1] > near
+        visible |= view.camera.project(safe)[1] > near
         too_close |= np.linalg.norm(safe - view.camera.center, axis=1) < near
-    return np.asarray(finite & seen & ~too_close)
+    return np.asarray(finite & visible & ~too_close)
 
 
 def random_rotations(count: int, generator: torch.Generator) -> Tensor:
@@ -163,7 +163,7 @@ def _no_points(points: np.ndarray, scene: Scene, near: float) -> Exception:
     if int(usable_points(points, scene, 0.0).sum()) >= 2:
         return ProtocolError(
             f"near = {near:g} leaves none of the {len(points)} points of scene {scene.name} (extent {scene.extent:g}); "
-            "take a protocol whose near fits, such as --protocol generic"
+            "use a protocol with a smaller near, such as --protocol generic"
         )
     return DataError(
         f"scene {scene.name} has {len(points)} points, but fewer than 2 are finite and in front of a camera; "

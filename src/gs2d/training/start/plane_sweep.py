@@ -26,7 +26,7 @@ from gs2d.kernels.sweep import BestPlanes, sweep_planes
 from gs2d.losses.formulas import flatness
 from gs2d.training.start.sweep_range import SweepRange, sweep_range
 
-PLANES = 64  # depths that are tried for each pixel
+PLANES = 64  # depths tried for each pixel
 MIN_NCC = 0.5  # depths with a lower NCC are unknown
 AGREE = 0.02  # depths of two views agree when they differ by at most this fraction
 VOTES = 2  # neighbours that must agree on the depth of a splat
@@ -64,7 +64,7 @@ class Windows:
 
 
 FINE_WINDOWS = Windows(3, 1e-4, 2e-5)
-WIDE_WINDOWS = Windows(7, 1e-5, 2e-6)  # for bare pixels, where only faint shading tells the depth
+WIDE_WINDOWS = Windows(7, 1e-5, 2e-6)  # for bare pixels, where only faint shading reveals the depth
 BARE = 127  # flatness, 0 to 255, of these
 
 
@@ -77,7 +77,7 @@ class SmallView:
     color : Tensor [3, H, W]
     grey : Tensor [1, 1, H, W]
     usable : ndarray [H, W] bool
-        Pixels that are not masked, and opaque.
+        Unmasked, opaque pixels.
     K, T : ndarray [3, 3], [4, 4] float64
         Intrinsics at this size; T_cam_world.
     near, far : float, world units
@@ -133,7 +133,7 @@ class Sweep:
         """Return how many neighbours of a view must agree on a depth."""
         return min(VOTES, max(1, len(self.neighbours[index]) - 1))
 
-    def known(self, index: int) -> np.ndarray:
+    def consistent(self, index: int) -> np.ndarray:
         """Return the pixels on whose depth enough neighbours agree, bool [H, W]."""
         return self.agreeing(index, AGREE) >= self.quorum(index)
 
@@ -141,12 +141,12 @@ class Sweep:
         """Return the number of neighbours that have the same depth for the point of each pixel, int [H, W]."""
         view, depth = self.views[index], self.depths[index]
         votes = np.zeros(depth.shape, dtype=np.int64)
-        known = depth > 0
-        places = unproject(view, depth)[known]
+        valid = depth > 0
+        places = unproject(view, depth)[valid]
         for other in self.neighbours[index]:
             z, column, row, inside = project(self.views[other], places)
             there = self.depths[other][row, column]
-            votes[known] += inside & (there > 0) & (np.abs(there - z) <= fraction * z)
+            votes[valid] += inside & (there > 0) & (np.abs(there - z) <= fraction * z)
         return votes
 
 
@@ -163,12 +163,12 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     DataError
         If the capture has neither sparse points nor bounds that two images show.
     """
-    known, factor = sweep_range(scene), sweep_downscale(scene, settings)
+    depth_range, factor = sweep_range(scene), sweep_downscale(scene, settings)
     limit = 0 if scene.ahead else cache_bytes(SWEEP_BYTES)
-    views = Spilled(_trimming(_shrunk(view, known, factor) for view in scene.train), limit)
-    neighbours = _neighbours(scene, views, known.observed, settings)
-    found = Spilled(_trimming(_depths(views, index, neighbours[index]) for index in range(len(views))), limit)
-    return Sweep(views, neighbours, found.column(0), found.column(1))
+    views = Spilled(_trimming(_shrunk(view, depth_range, factor) for view in scene.train), limit)
+    neighbours = _neighbours(scene, views, depth_range.observed, settings)
+    maps = Spilled(_trimming(_depths(views, index, neighbours[index]) for index in range(len(views))), limit)
+    return Sweep(views, neighbours, maps.column(0), maps.column(1))
 
 
 def sweep_downscale(scene: Scene, settings: DenseStart) -> int:
@@ -195,31 +195,31 @@ def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
     return np.asarray((rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3])
 
 
-def _shrunk(view: View, known: SweepRange, factor: int) -> SmallView:
-    camera, observed = view.camera, known.observed
+def _shrunk(view: View, depth_range: SweepRange, factor: int) -> SmallView:
+    camera, observed = view.camera, depth_range.observed
     image = torch.from_numpy(np.ascontiguousarray(view.target((0.0, 0.0, 0.0)))).permute(2, 0, 1)[None]
     height, width = camera.height // factor * factor, camera.width // factor * factor
     small = F.avg_pool2d(image[:, :, :height, :width], factor)
     usable: np.ndarray = np.ones((camera.height, camera.width), dtype=bool)
-    for left_in in (view.mask(), None if (alpha := view.alpha()) is None else alpha >= 0.5):
-        if left_in is not None:
-            usable[~left_in] = False
+    for mask in (view.mask(), None if (alpha := view.alpha()) is None else alpha >= 0.5):
+        if mask is not None:
+            usable[~mask] = False
     blocks = usable[:height, :width].reshape(height // factor, factor, width // factor, factor)
-    left = np.logical_and.reduce(blocks, axis=(1, 3))
+    valid = np.logical_and.reduce(blocks, axis=(1, 3))
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     K[:2] /= factor
     shown = observed.in_view(view.name, camera)
     enough = len(shown.depth) >= MIN_POINTS
     near, far = np.percentile(shown.depth, (1, 99)) * (NEAR_MARGIN, FAR_MARGIN) if enough else (0.0, 0.0)
-    near, far = known.limits.get(view.name, (near, far))
+    near, far = depth_range.limits.get(view.name, (near, far))
     middle = float(np.median(shown.depth)) if len(shown.depth) else 0.0
-    certain = slice(0) if observed.guessed else slice(None)
-    pixels = np.minimum(shown.pixels[certain] / factor, np.array((width // factor, height // factor)) - 0.5)
+    exact = slice(0) if observed.guessed else slice(None)
+    pixels = np.minimum(shown.pixels[exact] / factor, np.array((width // factor, height // factor)) - 0.5)
     grey = (small * torch.tensor(GREY)[:, None, None]).sum(dim=1, keepdim=True)
     T = np.asarray(camera.T_cam_world, dtype=np.float64)
     everywhere = observed.inside(camera).depth  # an image matches only some of the points inside it
     nearest = float(np.percentile(everywhere, NEAREST)) if enough else 0.0
-    return SmallView(small[0], grey, left, K, T, float(near), float(far), middle, pixels, shown.depth[certain], nearest)
+    return SmallView(small[0], grey, valid, K, T, float(near), float(far), middle, pixels, shown.depth[exact], nearest)
 
 
 def _neighbours(
@@ -246,14 +246,14 @@ def _neighbours(
         fits = (angle >= settings.min_angle) & (angle <= MAX_ANGLE) & (shared >= MIN_SHARED)
         fits[index] = False
         width = np.where(angle < BEST_ANGLE, NARROW, WIDE)
-        worth = np.where(fits, shared * np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * width**2)), 0.0)
-        order = np.argsort(-worth, kind="stable")[: settings.neighbours]
-        return tuple(int(i) for i in order if worth[i] > 0)
+        score = np.where(fits, shared * np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * width**2)), 0.0)
+        order = np.argsort(-score, kind="stable")[: settings.neighbours]
+        return tuple(int(i) for i in order if score[i] > 0)
 
-    found = {index: compared(index) for index in chosen}
-    for index in sorted({other for others in found.values() for other in others} - found.keys()):
-        found[index] = compared(index)
-    return tuple(found.get(index, ()) for index in range(count))
+    neighbours = {index: compared(index) for index in chosen}
+    for index in sorted({other for others in neighbours.values() for other in others} - neighbours.keys()):
+        neighbours[index] = compared(index)
+    return tuple(neighbours.get(index, ()) for index in range(count))
 
 
 def _shared(rows: Sequence[np.ndarray]) -> Any:
@@ -306,8 +306,8 @@ def best_planes(view: SmallView, others: Sequence[SmallView], z: Tensor, windows
     turned, moved = (torch.stack([pair[k] for pair in pairs]).float() for k in (0, 1))
     grey = [other.grey[0, 0] for other in others]
     usable = torch.from_numpy(view.usable)
-    found = sweep_planes(view.grey[0, 0], usable, grey, turned, moved, z, radius=windows.radius, noise=windows.noise)
-    return found or best_planes_reference(view, others, z, windows)
+    native = sweep_planes(view.grey[0, 0], usable, grey, turned, moved, z, radius=windows.radius, noise=windows.noise)
+    return native or best_planes_reference(view, others, z, windows)
 
 
 def best_planes_reference(view: SmallView, others: Sequence[SmallView], z: Tensor, windows: Windows) -> BestPlanes:
@@ -343,10 +343,10 @@ def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, windows
     radius, mine = windows.radius, _blurred(view.grey, windows.radius)
 
     def at_depths(some: Tensor) -> Tensor:
-        seen = turned[:, None, :] * some[None, :, None] + moved[:, None, None]  # [3, D, HW]
-        depth = seen[2].clamp_min(1e-9)
-        at = torch.stack([seen[0] / depth * (2 / columns) - 1, seen[1] / depth * (2 / rows) - 1], dim=-1)
-        inside = (at.abs() < 1).all(dim=-1) & (seen[2] > 0)
+        projected = turned[:, None, :] * some[None, :, None] + moved[:, None, None]  # [3, D, HW]
+        depth = projected[2].clamp_min(1e-9)
+        at = torch.stack([projected[0] / depth * (2 / columns) - 1, projected[1] / depth * (2 / rows) - 1], dim=-1)
+        inside = (at.abs() < 1).all(dim=-1) & (projected[2] > 0)
         fetched = F.grid_sample(other.grey, at[None], align_corners=False, padding_mode="border")
         fetched = fetched.reshape(len(some), 1, height, width)
         mean = _blurred(fetched, radius)

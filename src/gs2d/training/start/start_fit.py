@@ -23,7 +23,7 @@ _TINY = 1e-9  # keeps the equations of splats that no view shows solvable
 
 
 @torch.no_grad()
-def fit_start(splats: Splats, sweep: Sweep, kept: Tensor | None = None) -> Splats:
+def fit_start(splats: Splats, sweep: Sweep, sparse: Tensor | None = None) -> Splats:
     """Return the splats with colour, opacity and size fitted to the views of a sweep (formulas: docs/math.md).
 
     A view shows a splat if its swept depth is that of the splat, to ``AGREE``. Splats that no view shows keep their
@@ -34,8 +34,8 @@ def fit_start(splats: Splats, sweep: Sweep, kept: Tensor | None = None) -> Splat
     splats : Splats
         Result of :func:`gs2d.training.start.initialize.initial_splats`.
     sweep : Sweep
-    kept : Tensor [N] bool, optional
-        Splats of sparse points apart from the swept ones: they keep their opacity, and their size up to
+    sparse : Tensor [N] bool, optional
+        Splats of sparse points far from the swept ones; they keep their opacity, and their size up to
         ``MAX_SPARSE_SIZE``.
     """
     sums, weights, pixel = _observations(splats.means.double().numpy(), sweep)
@@ -45,9 +45,9 @@ def fit_start(splats: Splats, sweep: Sweep, kept: Tensor | None = None) -> Splat
     of_pixel = torch.from_numpy(np.log(pixel)).to(splats.log_scales)[:, None]
     log_scales = torch.minimum(splats.log_scales + math.log(SIZE), of_pixel + math.log(MAX_SIZE))
     logits = torch.full_like(splats.opacity_logits, math.log(OPACITY / (1 - OPACITY)))
-    if kept is not None:
-        log_scales[kept] = torch.minimum(splats.log_scales, of_pixel + math.log(MAX_SPARSE_SIZE))[kept]
-        logits[kept] = splats.opacity_logits[kept]
+    if sparse is not None:
+        log_scales[sparse] = torch.minimum(splats.log_scales, of_pixel + math.log(MAX_SPARSE_SIZE))[sparse]
+        logits[sparse] = splats.opacity_logits[sparse]
     return replace(splats, log_scales=log_scales, opacity_logits=logits, sh0=sh0)
 
 

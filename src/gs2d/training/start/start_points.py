@@ -39,7 +39,7 @@ def start_points(
     sweep : Sweep
     settings : DenseStart
     around : tuple of ndarray, optional
-        Further points with a size of their own: positions, colours in [0, 1], normals [P, 3], sizes [P].
+        Further points with sizes: positions, colours in [0, 1], normals [P, 3], sizes [P].
 
     Raises
     ------
@@ -48,7 +48,7 @@ def start_points(
     """
     if not any(sweep.neighbours) and not _has_points(scene):
         raise DataError(
-            f"a plane sweep of {scene.name} needs photographs whose viewing directions are {settings.min_angle:g} to "
+            f"a plane sweep of {scene.name} needs images whose viewing directions are {settings.min_angle:g} to "
             f"{MAX_ANGLE:g} degrees apart, got none; set dense_start.min_angle, or train with "
             "--set dense_start=null"
         )
@@ -62,8 +62,8 @@ def start_points(
         parts.append(_apart(scene.points, swept, settings.cell))
     elif len(swept.places) < 2:
         raise DataError(
-            f"a plane sweep of {scene.name} must find at least 2 points on which photographs agree, got "
-            f"{len(swept.places)}; check that photographs and cameras match, or train with --set dense_start=null"
+            f"a plane sweep of {scene.name} must find at least 2 points on which images agree, got "
+            f"{len(swept.places)}; check that images and cameras match, or train with --set dense_start=null"
         )
     if not settings.fit:  # sparse points get their size from all neighbours, swept ones included
         parts = [(*part[:3], np.zeros(len(part[3]))) for part in parts]
@@ -133,12 +133,12 @@ def _unique_rows(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _swept(sweep: Sweep, index: int) -> StartPoints:
     """Return the points of a view on which enough neighbours agree."""
-    view, depth, kept = sweep.views[index], sweep.depths[index], sweep.known(index)
+    view, depth, valid = sweep.views[index], sweep.depths[index], sweep.consistent(index)
     places = unproject(view, depth)
     normals = np.cross(np.gradient(places, axis=1), np.gradient(places, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     colors, score = view.color.permute(1, 2, 0).numpy(), sweep.scores[index]
-    return StartPoints(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], score[kept])
+    return StartPoints(places[valid], colors[valid], normals[valid], (depth / view.K[0, 0])[valid], score[valid])
 
 
 def _between(sweep: Sweep, swept: StartPoints, cell: float) -> StartPoints:

@@ -55,7 +55,7 @@ def _range_of_bounds(scene: Scene) -> SweepRange:
     sides = bounds[1] - bounds[0]
     if not (np.isfinite(bounds).all() and (sides > 0).all()):
         raise DataError(
-            f"a plane sweep without sparse points needs the box that {scene.name} lies in, got {bounds.tolist()}; "
+            f"a plane sweep without sparse points needs the bounds of {scene.name}, got {bounds.tolist()}; "
             "train with --set dense_start=null"
         )
     cell = sides / GRID
@@ -65,13 +65,13 @@ def _range_of_bounds(scene: Scene) -> SweepRange:
     for view in scene.train:  # each view carves the remaining points
         places = places[~_shows(view, places, half)[1]]
     inside = np.stack([_shows(view, places, half)[0] for view in scene.train])
-    left = inside.sum(axis=0) >= 2
-    if not left.any():
+    shared = inside.sum(axis=0) >= 2
+    if not shared.any():
         raise DataError(
-            f"a plane sweep of {scene.name} needs points in its bounds that two photographs show, inside the "
+            f"a plane sweep of {scene.name} needs points in its bounds that two images show, inside the "
             "silhouettes of those with an alpha channel, got none; train with --set dense_start=null"
         )
-    places, inside = places[left], inside[:, left]
+    places, inside = places[shared], inside[:, shared]
     limits = {}
     for index, view in enumerate(scene.train):
         z = view.camera.project(places[inside[index]])[1]
@@ -80,9 +80,9 @@ def _range_of_bounds(scene: Scene) -> SweepRange:
             limits[view.name] = (least, float(z.max()) + half)
     step = max(1, len(places) // MAX_PLACES)
     chosen, inside = places[::step], inside[:, ::step]
-    seen = {view.name: np.flatnonzero(inside[index]) for index, view in enumerate(scene.train)}
+    visible = {view.name: np.flatnonzero(inside[index]) for index, view in enumerate(scene.train)}
     track = np.full(len(chosen), TRACK)
-    return SweepRange(ObservedPoints(chosen, np.zeros(len(chosen)), track, seen, "points in the bounds"), limits)
+    return SweepRange(ObservedPoints(chosen, np.zeros(len(chosen)), track, visible, "points in the bounds"), limits)
 
 
 def _shows(view: View, places: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Find large splats that the training images barely show.
+"""Find large splats that are barely visible in the training images.
 
 A splat whose corner explains a few pixels may be as large as a wall. No loss constrains the rest of it, outside of all
 images, and a new view may show nothing else.
@@ -105,8 +105,8 @@ def shown_weights(splats: Splats, camera: Camera, raster: RasterSettings, backen
     bare = replace(raster, sh_degree=0, with_distortion=False)
     with torch.enable_grad():
         output = rasterize(Splats(**{**parts, "sh0": grey}), camera, bare, backend=backend)
-        (found,) = torch.autograd.grad(output.color[..., 0].sum(), grey)
-    return found[:, 0, 0] / C0
+        (gradient,) = torch.autograd.grad(output.color[..., 0].sum(), grey)
+    return gradient[:, 0, 0] / C0
 
 
 @torch.no_grad()
@@ -116,9 +116,9 @@ def whole_weights(splats: Splats, camera: Camera) -> Tensor:
     It is the integral of the Gaussian over the image plane, to first order; 0 behind the camera.
     """
     pose = torch.as_tensor(camera.T_cam_world, dtype=splats.dtype, device=splats.device)
-    seen = splats.means @ pose[:3, :3].T + pose[:3, 3]
+    local = splats.means @ pose[:3, :3].T + pose[:3, 3]
     normals = quats_to_matrices(splats.quats)[:, :, 2] @ pose[:3, :3].T
-    z = seen[:, 2].clamp_min(1e-9)
-    area = 2 * torch.pi * splats.scales.prod(dim=1) * (seen * normals).sum(dim=1).abs() / z  # facing the image plane
+    z = local[:, 2].clamp_min(1e-9)
+    area = 2 * torch.pi * splats.scales.prod(dim=1) * (local * normals).sum(dim=1).abs() / z  # facing the image plane
     weight = splats.opacities.reshape(-1) * area * (camera.fx * camera.fy) / z.square()
-    return torch.where(seen[:, 2] > 0, weight, torch.zeros_like(weight))
+    return torch.where(local[:, 2] > 0, weight, torch.zeros_like(weight))

@@ -14,7 +14,7 @@ from gs2d.losses.known_maps import Priors, rays
 from gs2d.losses.prior_formulas import MetricDepth
 
 
-def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
+def with_prior_points(scene: Scene, recipe: Recipe) -> Scene:
     """Return the scene with points on its known depth maps, if the recipe has a depth prior that adds them.
 
     They are the points of about ``init_points`` random pixels of all training views. Splats move only a few percent of
