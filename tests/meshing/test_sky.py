@@ -67,3 +67,8 @@ def test_a_smooth_floor_or_table_below_the_horizon_is_not_sky() -> None:
     found = sky_in(level, wall_points(level), horizon=0.2)
     assert found[: int(0.2 * HEIGHT)].all()
     assert not found[int(0.2 * HEIGHT) :].any()
+
+
+def test_image_noise_is_no_texture() -> None:
+    image = castle(noise=0.012)
+    assert sky_in(image, wall_points(image))[: ROOF - 16].mean() > 0.95

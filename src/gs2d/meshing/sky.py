@@ -2,7 +2,7 @@
 
 Training assigns an arbitrary depth to the sky, often that of an adjacent roof, on which neighbouring views agree. Depth
 alone cannot distinguish such a sheet from a wall, but the image can: sky is smooth, has no sparse points, reaches the
-border of the image, and is above the horizon.
+border of the image, and is above the horizon. So are some ceilings: ``sky_distance.py`` tells them apart.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_propagation, distance_transform_edt, label, uniform_filter
 
 SIDE = 400  # px; images are downscaled to this longer side
-RADIUS = 3  # px there; texture is the difference from the mean of 7x7 pixels
-SMOOTH = 2.5 / 255  # standard deviation of texture: above image noise, below plaster
+FINE, RADIUS = 3, 3  # px there; texture is the difference between the means of 3x3 and of 7x7 pixels
+SMOOTH = 2 / 255  # standard deviation of texture: above image noise, below plaster
 APART = 1 / 20  # of the longer side: distance of seeds from sparse points, and of pixels from seeds
 BESIDE = 1 / 100  # of the longer side: smallest distance of sky from a sparse point
 LEAST = 0.03  # of the image: smallest area of sky
@@ -52,7 +52,8 @@ def _smooth_areas(image: np.ndarray, points: np.ndarray, above: np.ndarray, vali
         return valid
     if not valid.all():  # the edge of the valid area must not count as texture
         image = image[tuple(distance_transform_edt(~valid, return_distances=False, return_indices=True))]
-    detail = image - uniform_filter(image, (window, window, 1))
+    # of 3x3 means: image noise does not count
+    detail = uniform_filter(image, (FINE, FINE, 1)) - uniform_filter(image, (window, window, 1))
     smooth = valid & above & (uniform_filter((detail * detail).max(axis=2), window) < SMOOTH**2)
     empty = np.ones((height, width), bool)
     empty[np.minimum(points[:, 1], height - 1), np.minimum(points[:, 0], width - 1)] = False

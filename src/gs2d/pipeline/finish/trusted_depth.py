@@ -12,10 +12,12 @@ from gs2d.data import Scene, View
 from gs2d.data.bounds import Reach, reach_of
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.sky import sky_pixels
+from gs2d.meshing.sky_distance import at_infinity, smooth_area
 from gs2d.pipeline.prepare.loaded import Trained
 
 BEYOND = 1.25  # times the reach of a scene (``data/bounds.py``); depth beyond it is ignored
 MIN_POINTS = 20  # sparse points in a photograph to search it for sky
+COMPARED = 48  # photographs, evenly chosen, that tell whether smooth areas are sky
 
 
 def believed_reach(scene: Scene) -> Reach | None:
@@ -42,14 +44,24 @@ def within_reach(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray
 
 
 def sky_direction(trained: Trained) -> np.ndarray | None:
-    """Return the up direction [3], in which sky is searched; None if the photographs are not searched.
+    """Return the up direction [3], in which sky is searched; None if the photographs show none.
 
-    Protocols of data sets have limits of their own, and alpha channels mark what is empty.
+    Protocols of data sets have limits of their own, and alpha channels mark what is empty. In a room, walls
+    and ceilings are smooth; photographs tell that they are near (``meshing/sky_distance.py``).
     """
     scene = trained.scene
-    if not trained.protocol.fusion.subject or scene.observed() is None or scene.train[0].alpha() is not None:
+    observed = scene.observed()
+    if not trained.protocol.fusion.subject or observed is None or scene.train[0].alpha() is not None:
         return None
-    return up_direction([view.camera for view in scene.train])
+    up = up_direction([view.camera for view in scene.train])
+    areas = []
+    for index in np.unique(np.linspace(0, len(scene.train) - 1, min(len(scene.train), COMPARED)).round().astype(int)):
+        view = scene.train[index]
+        sky, shown = sky_of(trained, view, up), observed.in_view(view.name, view.camera)
+        if sky.any() and len(shown.depth):
+            image = view.target(trained.settings.background)
+            areas.append(smooth_area(view.camera, image, sky, shown.pixels, shown.depth))
+    return up if at_infinity(areas) else None
 
 
 def sky_of(trained: Trained, view: View, up: np.ndarray) -> np.ndarray:
