@@ -19,7 +19,9 @@ def test_recipes_lists_three_or_all_and_shows_one(capsys: pytest.CaptureFixture[
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["best", "best-fast", "2dgs", str(len(RECIPES) - 3)]
     assert run(["recipes", "--all"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(RECIPES)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(RECIPES)
+    assert max(map(len, lines)) <= 80
     assert run(["recipes", "2dgs-r"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert [stage["iterations"] for stage in shown["stages"]] == [30000, 10000, 20000]

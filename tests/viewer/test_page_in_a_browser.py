@@ -94,7 +94,8 @@ def as_at_first(request: pytest.FixtureRequest) -> None:
         tab = request.getfixturevalue("page")
         tab.size(640, 420)
         tab.ask("$('help').close(); limited = true; $('free').checked = false; document.body.classList.remove('bare');"
-                "resetCrop(); editCrop(false); setCrop(true); setMeasuring(false); setKind(0); show('splats');"
+                "toggleTools(true); resetCrop(); editCrop(false); setCrop(true); setMeasuring(false); setKind(0);"
+                "show('splats');"
                 "press('showcameras', false); goHome(); document.activeElement.blur()")  # fmt: skip
         still(tab)
 
@@ -228,9 +229,17 @@ def test_a_click_on_a_camera_goes_there_and_shows_its_photograph_until_the_view_
     page.until("$('photograph').hidden")
 
 
+def test_the_controls_fit_in_one_row_of_a_tablet_or_laptop(page: Page) -> None:
+    page.ask("toggleTools(false)")
+    for width in (820, 960, 1160, 1400):
+        page.size(width, 420)
+        assert page.ask("$('bar').offsetHeight") < 2 * 32, width
+
+
 def test_a_phone_has_every_button_in_sight_turns_and_pinches(page: Page) -> None:
     page.size(375, 667, phone=True)
     try:
+        page.ask("toggleTools(false)")
         page.click("#tools")
         shown = page.ask(
             "[...document.querySelectorAll('#bar button')].filter((b) => b.checkVisibility())"

@@ -308,10 +308,10 @@ def add_recipe(name: str, about: str, build: Callable[..., Recipe], *, module: s
     RECIPES.register(name, module=module)(recipe)
 
 
-add_recipe("best", "The default: 2DGS from a dense start, most quality per time", best)
+add_recipe("best", "The default: 2DGS, dense start, most quality per time", best)
 add_recipe("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
 add_recipe("2dgs", "2DGS, the paper's baseline, and stage 1 of 2dgs-r", two_dgs)
-add_recipe("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
+add_recipe("2dgs-r", "2DGS-R: surface, worst 1 %, clone in place and refine", two_dgs_r)
 
 
 def register_recipe(name: str) -> Callable[[Register], Register]:

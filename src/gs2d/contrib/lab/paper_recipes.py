@@ -60,21 +60,21 @@ def _register_rows() -> None:
     add("2dgs-no-nc", "2DGS without normal consistency", partial(two_dgs, nc=0.0))
     add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: its control", two_dgs_60k)
     for label, nc in {"distortion": 0.05, "distortion-no-nc": 0.0}.items():
-        about = f"Table 1: the protocol's distortion weight (100/10), NC {nc:g}"
+        about = f"Table 1: protocol's distortion weight (100/10), NC {nc:g}"
         add(f"2dgs-{label}", about, partial(two_dgs, nc, None))
     for nc in (0.1, 0.3):
         add(f"2dgs-nc-{nc}", f"Table 1: NC {nc}", partial(two_dgs, nc))
     for k in (3, 5, 10, 30, 50):
         add(f"2dgs-r-k{k}", f"K ablation: the worst {k} %", partial(two_dgs_r, stage_2=appearance(float(k))))
     for label, freeze in {"none": (), "alpha-sh": ALPHA + SH, "sh": SH}.items():
-        about = f"Freeze ablation: stage 3 freezes {', '.join(freeze) or 'nothing'}"
+        about = f"Freeze ablation: {', '.join(freeze) or 'nothing'} in stage 3"
         add(f"2dgs-r-freeze-{label}", about, partial(two_dgs_r, stage_3=refine(freeze=freeze)))
     module_ii = partial(two_dgs_r, stage_3=refine(nc=0.0, freeze=()))
     add("2dgs-r-module-ii", "Module row II: clone; opacity free, no NC in stage 3", module_ii)
     add("2dgs-r-module-iii", "Module row III: II with opacity frozen", partial(two_dgs_r, stage_3=refine(nc=0.0)))
     for label, densify in {"d": ABSGS_DEFAULT, "a": ABSGS_ADJUSTED}.items():
         stage_3 = refine(freeze=(), densify=densify)
-        about = f"AbsGS-{label.upper()}: stage 3 uses absolute gradients, no clone; opacity free"
+        about = f"AbsGS-{label.upper()} in stage 3 instead of the clone; opacity free"
         add(f"2dgs-r-absgs-{label}", about, partial(two_dgs_r, stage_3=stage_3))
 
 
