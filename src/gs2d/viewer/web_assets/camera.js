@@ -51,14 +51,14 @@ function goHome() {
   // At the camera of a photograph; an object is centred and fills the window.
   goTo(facts.subject.home);
   if (isObject) {
-    const arm = plus(center, camera.eye, -1), distance = norm(arm), shorter = Math.min(camera.w, camera.h);
+    const arm = plus(center, camera.eye, -1), distance = norm(arm), longer = Math.max(camera.w, camera.h);
     if (Math.abs(dot(unit(arm), facts.up)) < 0.99) {
       camera.ahead = unit(arm);
       camera.right = unit(cross(camera.ahead, facts.up));
       camera.down = cross(camera.ahead, camera.right);
     }
     const needed = 2.2 * camera.fx * Math.tan(Math.asin(Math.min(0.95, radius / distance)));
-    const side = clamp(needed, 0.4 * shorter, shorter); // not wider than the photograph: nothing was trained there
+    const side = clamp(needed, 0.4 * longer, longer); // not wider than the photograph: little was trained there
     [camera.w, camera.h, camera.cx, camera.cy] = [side, side, side / 2, side / 2];
     target = center;
   }
