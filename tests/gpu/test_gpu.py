@@ -255,9 +255,9 @@ def test_photographs_in_pinned_memory_are_those_on_the_device(gpu: Backend) -> N
     for _ in range(2):
         for index in range(len(views)):
             assert torch.equal(kept[index].image, pinned[index].image)
-    assert all(image.image.is_pinned() for image in pinned._kept.values())
-    assert all(image.image.is_cuda for image in kept._kept.values())
-    assert len(pinned._kept) == len(kept._kept) == len(views)
+    assert all(image.image.is_pinned() for image in pinned._cached.values())
+    assert all(image.image.is_cuda for image in kept._cached.values())
+    assert len(pinned._cached) == len(kept._cached) == len(views)
 
 
 def test_peak_memory_is_bounded_by_what_is_documented(gpu: Backend) -> None:

@@ -208,7 +208,7 @@ def do(case: str, many: Any) -> Any:
         return {"state": state.state_dict(), "losses": heard["losses"]}
     if case == "resumed":  # in mid-stage: only process 0 passes a state
         whole, heard = trained(short(), many)
-        kept = many.tell(heard["states"][3]) if many.leads else many.tell(None)
+        kept = many.broadcast(heard["states"][3]) if many.leads else many.broadcast(None)
         state, _ = trained(short(), many, kept if many.leads else None)
         return {"state": state.state_dict(), "whole": whole.state_dict(), "at": (kept["stage"], kept["step"])}
     if case == "differing":  # a bit of one splat flips in the last process

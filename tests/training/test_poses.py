@@ -48,7 +48,7 @@ def test_a_similarity_of_the_scene_is_no_camera_motion(scene: Scene) -> None:
     values = 1e-3 * torch.randn(VIEWS, 6, generator=g, dtype=torch.float64)
     before = motions(made, values)
     assert before.abs().max() > 1e-4
-    J = similarity_motions(made.given, made.extent)
+    J = similarity_motions(made.initial, made.extent)
     values += torch.from_numpy(J @ np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.6, 0.7]))
     torch.testing.assert_close(motions(made, values), before, rtol=1e-9, atol=1e-12)
     units = np.array([1.0] * 3 + [made.extent] * 3)
@@ -58,7 +58,7 @@ def test_a_similarity_of_the_scene_is_no_camera_motion(scene: Scene) -> None:
 @pytest.mark.parametrize("k", range(7))
 def test_similarity_motions_keep_the_images(scene: Scene, k: int) -> None:
     # The scene moves together with each camera: x_cam is unchanged (or scaled with the scene).
-    given, step, extent = CameraPose(POSES, scene).given, 1e-6, 2.0
+    given, step, extent = CameraPose(POSES, scene).initial, 1e-6, 2.0
     middle = np.mean([view.camera.center for view in scene.train], axis=0)
     w, v, grow = np.eye(7)[k, :3] * step, np.eye(7)[k, 3:6] * step * extent, 1 + step * (k == 6)
     S = se3_exp(torch.tensor([*w, 0.0, 0.0, 0.0], dtype=torch.float64)).numpy()
@@ -74,7 +74,7 @@ def test_similarity_motions_keep_the_images(scene: Scene, k: int) -> None:
 def test_a_single_camera_does_not_move(scene: Scene) -> None:
     made = CameraPose(POSES, replace(scene, train=scene.train[:1]))
     pose = made.pose(torch.full((1, 6), 0.1, dtype=torch.float64), 0)
-    torch.testing.assert_close(pose, torch.from_numpy(made.given[0]))
+    torch.testing.assert_close(pose, torch.from_numpy(made.initial[0]))
 
 
 def test_the_pose_gradient_is_that_of_the_loss(scene: Scene) -> None:

@@ -88,8 +88,8 @@ class CachedViews:
         parameters = dict(state.splats.items())
         leaves = {name: parameters[name][self.rows].requires_grad_(name in stage.train) for name in sorted(COLORS)}
         color = self.views[index].render(leaves["sh0"], leaves["shN"])
-        unseen = color.new_empty(0)  # losses of such a stage read only the colour
-        output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
+        unused = color.new_empty(0)  # losses of such a stage read only the colour
+        output = RenderOutput(color, unused, unused, unused, unused, unused, unused)
         camera = self._whole.camera(state, index)  # constant in a stage that moves no splats
-        found = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
-        return replace(found, rows=self.rows)
+        result = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
+        return replace(result, rows=self.rows)

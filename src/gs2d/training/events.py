@@ -28,7 +28,7 @@ class Initialised(TrainingEvent):
 
     kind: ClassVar[str] = "initialised"
     splats: int
-    # "points" (of the scene), "sweep" (dense start), "depths" (points and known depths), "random", or "splats"
+    # "points" (of the scene), "sweep" (dense start), "depths" (points on depth maps), "random", or "splats"
     # (passed by the caller)
     source: str
     dropped: int  # unusable points
@@ -181,7 +181,7 @@ class Notice:
     text: str
     # A decision that needs no action: printed with ``--verbose``, and logged in ``events.jsonl`` before training.
     detail: bool = False
-    is_warning: bool = False  # a part of the input is left out
+    is_warning: bool = False  # a part of the input is ignored
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class StageScored:
 
 @dataclass(frozen=True)
 class NotMade:
-    """A file or a section of the result could not be made; the run continues."""
+    """A file or a section of the result could not be written; the run continues."""
 
     what: str  # file or section
     reason: str  # one line

@@ -46,10 +46,10 @@ def raster_settings(protocol: Protocol, extent: float, sh_degree: int, mip_px: f
 def visible_mask(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> Tensor:
     """Return the splats [N] bool whose footprint reaches a pixel of any view, hidden there or not."""
     bare = replace(settings, sh_degree=0, with_distortion=False)
-    seen = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
+    visible = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
     for view in views:
-        seen |= rasterize(splats, view.camera, bare, backend=backend).radii > 0
-    return seen
+        visible |= rasterize(splats, view.camera, bare, backend=backend).radii > 0
+    return visible
 
 
 class FullRender:
@@ -97,7 +97,7 @@ class FullRender:
         """Return the fraction of the splats that iterations of a stage leave out."""
         return dropout_rate(self.recipe, stage, len(self.scene.train))
 
-    def _left(self, splats: Splats, state: TrainState, stage: Stage, iteration: int) -> Splats:
+    def _rendered(self, splats: Splats, state: TrainState, stage: Stage, iteration: int) -> Splats:
         """Return the splats that an iteration renders."""
         rate = self.drops(stage)
         if rate > 0:
@@ -120,14 +120,14 @@ class FullRender:
             another = None
         settings = self.settings(stage, iteration, another)
         rows = learning_rows(state, stage) if probe is None else None  # the signal covers all splats
-        drawn, of_all = self._left(leaves, state, stage, iteration), probe
+        drawn, of_all = self._rendered(leaves, state, stage, iteration), probe
         rows = self._with_frozen(rows, len(splats), camera)
         if self.frozen is not None and probe is not None:
             of_all = torch.cat([probe, probe.new_zeros(len(self.frozen), probe.shape[1])])
         output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)
-        found = self.differentiate(state, stage, iteration, index, camera, output, dict(leaves.items()))
+        result = self.differentiate(state, stage, iteration, index, camera, output, dict(leaves.items()))
         signal = None if probe is None else _gradient(probe)
-        return replace(found, signal=signal, radii=output.radii[: len(splats)])
+        return replace(result, signal=signal, radii=output.radii[: len(splats)])
 
     def _with_frozen(self, rows: Tensor | None, count: int, camera: Camera) -> Tensor | None:
         """Extend the rows [N] with gradients by the frozen splats, which have none."""
@@ -146,8 +146,8 @@ class FullRender:
             numbers = self.learned.numbers(state.learned, index, splats.means)
             splats = shown_splats(splats, camera, numbers, settings.sh_degree)
             settings = replace(settings, sh_degree=0)
-        given = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
-        return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
+        options = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
+        return splat_errors(splats, camera, target.image, settings, **options)  # type: ignore[arg-type]
 
     def differentiate(
         self,

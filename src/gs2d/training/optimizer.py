@@ -21,11 +21,11 @@ from gs2d.training.state import Moments, TrainState
 def begin_stage(state: TrainState, stage: Stage) -> None:
     """Set the moments of the attributes that the stage trains: zeros, or with "kept" only the missing ones."""
     parameters = dict(state.splats.items())
-    kept = state.moments if stage.moments == "kept" else {}
+    previous = state.moments if stage.moments == "kept" else {}
     trained = {
-        name: kept.get(name) or Moments.zeros_like(parameters[name]) for name in ATTRIBUTES if name in stage.train
+        name: previous.get(name) or Moments.zeros_like(parameters[name]) for name in ATTRIBUTES if name in stage.train
     }
-    state.moments = kept | trained
+    state.moments = previous | trained
 
 
 def lr_at(lr: LearningRates, iteration: int, extent: float) -> dict[str, float]:

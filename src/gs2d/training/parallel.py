@@ -40,23 +40,23 @@ class Turn:
 
 
 class LostContactError(RunError):
-    """Another process of the training has ended. ``told``: another process reports that."""
+    """Another process of the training has ended. ``reported``: another process reports it."""
 
-    def __init__(self, message: str, *, told: bool) -> None:
+    def __init__(self, message: str, *, reported: bool) -> None:
         super().__init__(message)
-        self.told = told
+        self.reported = reported
 
 
 class ProcessGroup:
     """The processes that train together: this one alone, or the default group of ``torch.distributed``.
 
     In a single process, that without a ``place``, the collective operations do nothing. The group of several must be
-    initialised. ``hears`` returns whether this process has received a request to stop, ``stop_asked`` whether any
-    process had at the last :meth:`meet`.
+    initialised. ``stop_requested`` returns whether this process has received a request to stop; ``stops`` is whether
+    any process had at the last :meth:`meet`.
     """
 
-    def __init__(self, place: ProcessRank | None = None, hears: Callable[[], bool] = lambda: False) -> None:
-        self.place, self.hears, self.stop_asked = place or ProcessRank(), hears, False
+    def __init__(self, place: ProcessRank | None = None, stop_requested: Callable[[], bool] = lambda: False) -> None:
+        self.place, self.stop_requested, self.stops = place or ProcessRank(), stop_requested, False
         self._alone = self.place.size == 1
 
     @property
@@ -70,15 +70,15 @@ class ProcessGroup:
         return self.place.leads
 
     # -- messages ------------------------------------------------------------------------------------------------------
-    def tell(self, facts: T) -> T:
+    def broadcast(self, value: T) -> T:
         """Return the value of process 0."""
         if self._alone:
-            return facts
-        box: list[Any] = [facts]
+            return value
+        box: list[Any] = [value]
         with self.contact():
             distributed.broadcast_object_list(box, src=0)
-        told: T = box[0]
-        return told
+        received: T = box[0]
+        return received
 
     def announce(self) -> bool:
         """Announce that this process ends and reports why; return False if another one was first."""
@@ -100,7 +100,7 @@ class ProcessGroup:
                     f"process {self.place.rank} of {self.size} lost contact with another process, which has ended or "
                     f"cannot be reached ({reason}); continue from the last checkpoint with --resume, with any number "
                     "of processes",
-                    told=self._was_told(),
+                    reported=self._is_reported(),
                 ) from error
             raise
 
@@ -110,7 +110,7 @@ class ProcessGroup:
         except (RuntimeError, ValueError, AttributeError):
             return None
 
-    def _was_told(self) -> bool:
+    def _is_reported(self) -> bool:
         if not self.leads:  # process 0 reports it; the store may have ended with it
             return True
         try:
@@ -125,17 +125,17 @@ class ProcessGroup:
         if self._alone:
             return make()
         state = make() if self.leads else None
-        told = self.tell(None if state is None else state.state_dict())
-        return TrainState.from_state_dict(told or {}) if state is None else state
+        received = self.broadcast(None if state is None else state.state_dict())
+        return TrainState.from_state_dict(received or {}) if state is None else state
 
     def meet(self, state: TrainState) -> None:
         """Wait for the other processes, while process 0 may score or save; share requests to stop."""
         if self._alone:
             return
-        own = torch.tensor([state.stage, state.step, len(state.splats), len(state.queue), int(self.hears())])
-        met = self._all(own)
-        self.stop_asked = bool(met[:, -1].any())
-        self._same(met[:, :-1], state)
+        own = torch.tensor([state.stage, state.step, len(state.splats), len(state.queue), int(self.stop_requested())])
+        gathered = self._all(own)
+        self.stops = bool(gathered[:, -1].any())
+        self._same(gathered[:, :-1], state)
 
     def check(self, state: TrainState) -> None:
         """Raise RunError if a hash of splats, moments, statistics, generator and learned quantities differs."""
@@ -146,8 +146,8 @@ class ProcessGroup:
             digest.update(repr((tuple(tensor.shape), _checksum(tensor))).encode())
         self._same(self._all(torch.frombuffer(bytearray(digest.digest()), dtype=torch.int64)), state)
 
-    def _same(self, met: Tensor, state: TrainState) -> None:
-        differing = [rank for rank, own in enumerate(met.tolist()) if own != met[0].tolist()]
+    def _same(self, gathered: Tensor, state: TrainState) -> None:
+        differing = [rank for rank, own in enumerate(gathered.tolist()) if own != gathered[0].tolist()]
         if differing:
             raise RunError(
                 f"the states of processes 0 and {differing[0]} differ at iteration {state.step} of stage "
@@ -156,10 +156,10 @@ class ProcessGroup:
 
     def _all(self, own: Tensor) -> Tensor:
         """Gather a small host tensor [n] from all processes, [W, n]."""
-        met = [torch.empty_like(own) for _ in range(self.size)]
+        gathered = [torch.empty_like(own) for _ in range(self.size)]
         with self.contact():
-            distributed.all_gather(met, own)
-        return torch.stack(met)
+            distributed.all_gather(gathered, own)
+        return torch.stack(gathered)
 
     # -- an iteration --------------------------------------------------------------------------------------------------
     def evaluate(
@@ -202,12 +202,12 @@ class ProcessGroup:
         for name, shape in shapes.items():  # a flag for a present gradient, then its numbers
             numbers = own[name].double().cpu().flatten() if name in own else torch.zeros(math.prod(shape)).double()
             parts += [numbers.new_tensor([float(name in own)]), numbers]
-        found = []
+        gradients = []
         for view in self._all(torch.cat(parts)):
             pieces = view.split([len(part) for part in parts])
-            known = zip(shapes.items(), pieces[::2], pieces[1::2], strict=True)
-            found.append({name: numbers.reshape(shape) for (name, shape), has, numbers in known if has > 0})
-        return found
+            entries = zip(shapes.items(), pieces[::2], pieces[1::2], strict=True)
+            gradients.append({name: numbers.reshape(shape) for (name, shape), has, numbers in entries if has > 0})
+        return gradients
 
     def gather(self, statistics: Statistics, result: StepResult, add: Callable[[Statistics, StepResult], Any]) -> None:
         """Add the statistics of all views of the iteration in place; ``add`` adds those of one view."""
@@ -223,16 +223,16 @@ class ProcessGroup:
         """Return the mean of the losses over the views; a missing term counts 0."""
         if self._alone:
             return losses
-        found: list[Any] = [None] * self.size
+        gathered: list[Any] = [None] * self.size
         with self.contact():
-            distributed.all_gather_object(found, {kind: float(value) for kind, value in losses.items()})
-        kinds = dict.fromkeys(kind for one in found for kind in one)
-        return {kind: sum(one.get(kind, 0.0) for one in found) / views for kind in kinds}
+            distributed.all_gather_object(gathered, {kind: float(value) for kind, value in losses.items()})
+        kinds = dict.fromkeys(kind for one in gathered for kind in one)
+        return {kind: sum(one.get(kind, 0.0) for one in gathered) / views for kind in kinds}
 
     # -- work on all views ---------------------------------------------------------------------------------------------
-    def part(self, things: Sequence[T]) -> Sequence[T]:
+    def part(self, items: Sequence[T]) -> Sequence[T]:
         """Return the part of a sequence that this process works on: every W-th entry."""
-        return things[self.place.rank :: self.place.size]
+        return items[self.place.rank :: self.place.size]
 
     def sum(self, tensor: Tensor) -> Tensor:
         """Sum a tensor over the processes in place, and return it."""
@@ -249,10 +249,10 @@ class ProcessGroup:
         """Return what ``judge`` returns in process 0, of the shape and on the device of ``like``."""
         if self._alone:
             return judge()
-        found = judge() if self.leads else torch.empty_like(like, dtype=dtype)
+        decision = judge() if self.leads else torch.empty_like(like, dtype=dtype)
         with self.contact():
-            distributed.broadcast(found, src=0)
-        return found
+            distributed.broadcast(decision, src=0)
+        return decision
 
 
 ONE_PROCESS = ProcessGroup()

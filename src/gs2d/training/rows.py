@@ -1,6 +1,6 @@
 """The only functions that change N: parameters, moments, statistics and row groups change together.
 
-Each makes one pass: the kept rows of each tensor are gathered into new storage with room for the added rows.
+Each makes one pass: the retained rows of each tensor are gathered into new storage with room for the added rows.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ def append_rows(
     """
     groups = {} if groups is None else groups
     check_shapes({"means": (splats.means, "M 3")} | {f"group {k}": (mask, "M") for k, mask in groups.items()})
-    before, added, kept = len(state.splats), len(splats), _kept(state, keep)
-    stay = before if kept is None else len(kept)
+    before, added, retained = len(state.splats), len(splats), _retained_rows(state, keep)
+    stay = before if retained is None else len(retained)
 
     def rows_of(old: Tensor, new: Tensor | None = None) -> Tensor:
-        """Return the kept rows of ``old``, followed by those of ``new`` or zeros."""
-        if kept is None and added == 0:
+        """Return the retained rows of ``old``, followed by those of ``new`` or zeros."""
+        if retained is None and added == 0:
             return old
         result = old.new_empty(stay + added, *old.shape[1:])
-        if kept is None:
+        if retained is None:
             result[:stay] = old
         else:
-            torch.index_select(old, 0, kept, out=result[:stay])
+            torch.index_select(old, 0, retained, out=result[:stay])
         result[stay:] = 0 if new is None else new
         return result
 
@@ -66,12 +66,12 @@ def append_rows(
     state.groups = {name: rows_of(group, groups.get(name)) for name, group in old_groups.items()}
 
 
-def _kept(state: TrainState, keep: Tensor | None) -> Tensor | None:
-    """Return the kept rows [K] int64; None: all."""
+def _retained_rows(state: TrainState, keep: Tensor | None) -> Tensor | None:
+    """Return the retained rows [K] int64; None: all."""
     if keep is None:
         return None
     check_shapes({"means": (state.splats.means, "N 3"), "mask": (keep, "N")})
     if keep.dtype != torch.bool:
         raise ShapeError(f"mask must be bool [N], got {keep.dtype}")
-    kept = keep.nonzero().squeeze(1)
-    return None if len(kept) == len(keep) else kept
+    retained = keep.nonzero().squeeze(1)
+    return None if len(retained) == len(keep) else retained

@@ -135,22 +135,22 @@ class TrainState:
 
         Raise RunError if it is of another format, incomplete, or its tensors do not fit together.
         """
-        found = data.get("format") if isinstance(data, Mapping) else None
-        if found != FORMAT:
-            raise RunError(f"checkpoint must be of format {FORMAT}, got {str(found)[:40]!r}; train again")
+        version = data.get("format") if isinstance(data, Mapping) else None
+        if version != FORMAT:
+            raise RunError(f"checkpoint must be of format {FORMAT}, got {str(version)[:40]!r}; train again")
         try:
-            made = {entry.name: _plain(data[entry.name]) for entry in fields(cls)}
+            values = {entry.name: _plain(data[entry.name]) for entry in fields(cls)}
             generator = torch.Generator()
-            generator.set_state(made["generator"])
+            generator.set_state(values["generator"])
             objects = {
-                "splats": Splats(**made["splats"]),
+                "splats": Splats(**values["splats"]),
                 "generator": generator,
-                "moments": {name: Moments(**moments) for name, moments in made["moments"].items()},
-                "learned": {name: LearnedRows(**rows) for name, rows in made["learned"].items()},
-                "entered": bool(made["entered"]),
-                "processes": [(stage, step, count) for stage, step, count in made["processes"]],
+                "moments": {name: Moments(**moments) for name, moments in values["moments"].items()},
+                "learned": {name: LearnedRows(**rows) for name, rows in values["learned"].items()},
+                "entered": bool(values["entered"]),
+                "processes": [(stage, step, count) for stage, step, count in values["processes"]],
             }
-            state = cls(**made | objects)
+            state = cls(**values | objects)
             state.check()
             numbers = dict(state.splats.items()) | {name: rows.values for name, rows in state.learned.items()}
             for name, tensor in numbers.items():

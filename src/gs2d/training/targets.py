@@ -28,7 +28,7 @@ class Target:
 
     image: Tensor  # [H, W, 3] in [0, 1], over the background
     mask: Tensor | None  # [H, W] bool; False = ignore this pixel
-    mean: Tensor | None  # [H, W, 3]: local mean of the image for the native SSIM, of images that are kept
+    mean: Tensor | None  # [H, W, 3]: local mean of the image for the native SSIM, of cached images
     # [H, W]: alpha of the image in [0, 1], if it has an alpha channel and a loss needs it.
     silhouette: Tensor | None = None
     flatness: Tensor | None = None  # [H, W] uint8: ``losses.formulas.flatness`` of the image, if a loss needs it
@@ -119,16 +119,16 @@ class Targets:
         all_bytes = pixels * 3 * dtype.itemsize * (1 if mean is None else 2)
         room = cache_bytes(limit_bytes)
         self._room = room if room >= WORTH_KEEPING * all_bytes else 0
-        self._kept: dict[int, Target] = {}
+        self._cached: dict[int, Target] = {}
 
     def photograph(self, index: int) -> ImageBytes | None:
         """Return None: targets are kept as floats."""
         return None
 
     def __getitem__(self, index: int) -> Target:
-        kept = self._kept.get(index)
-        if kept is not None:
-            return kept
+        cached = self._cached.get(index)
+        if cached is not None:
+            return cached
         view = self._views[index]
         image = torch.as_tensor(view.target(self._background)).to(self._device, self._dtype)
         mask = view.usable(masks=self._use_masks)
@@ -145,7 +145,7 @@ class Targets:
         if self._mean is not None:
             target = replace(target, mean=self._mean(image))
         self._room -= target.nbytes
-        self._kept[index] = target
+        self._cached[index] = target
         return target
 
 
@@ -173,12 +173,12 @@ class DeviceTargets:
         self._background = torch.tensor(background, dtype=torch.float32, device=device)
         self._device, self._pin = device, pin
         self._room = {"device": limit_bytes, "pinned": pinned_bytes}
-        self._kept: dict[int, ImageBytes] = {}
+        self._cached: dict[int, ImageBytes] = {}
         self._buffers: dict[tuple[torch.Size, torch.dtype], Tensor] = {}  # for images from host memory
 
     def photograph(self, index: int) -> ImageBytes | None:
         """Return the bytes of an image; one from host memory is valid until the next call."""
-        return self._decoded(index).map(self._brought)
+        return self._decoded(index).map(self._on_device)
 
     def __getitem__(self, index: int) -> Target:
         there = self._decoded(index).map(lambda tensor: tensor.to(self._device, non_blocking=True))
@@ -194,7 +194,7 @@ class DeviceTargets:
         background = self._background.to(image.device)
         return (color - background) * alpha[..., None] + background, alpha
 
-    def _brought(self, tensor: Tensor) -> Tensor:
+    def _on_device(self, tensor: Tensor) -> Tensor:
         """Return a tensor on the device; copies of one shape share a buffer."""
         if tensor.device == self._device:
             return tensor
@@ -205,8 +205,8 @@ class DeviceTargets:
 
     def _decoded(self, index: int) -> ImageBytes:
         """Return an image that is kept, or decode it and keep it if there is room."""
-        if index in self._kept:
-            return self._kept[index]
+        if index in self._cached:
+            return self._cached[index]
         view = self._views[index]
         mask = view.usable(masks=self._use_masks)
         pixels = torch.tensor(view.image())
@@ -218,14 +218,14 @@ class DeviceTargets:
                 continue
             change = self._pin if place == "pinned" else lambda tensor: tensor.to(self._device)
             try:
-                self._kept[index] = image.map(change)
+                self._cached[index] = image.map(change)
             except RuntimeError:
                 if place == "device":
                     raise
                 self._room[place] = 0  # the system locks no more memory: slower, but no reason to stop
                 break
             self._room[place] -= image.nbytes(place)
-            return self._kept[index]
+            return self._cached[index]
         return image
 
 

@@ -70,7 +70,7 @@ class TrainerOptions:
         Returns which points [M, 3] belong to the trained part, [M] bool. With ``init`` and a dense start: training
         starts from the swept points in that part, and from ``init`` only if there are almost none.
     exposures : Tensor [V, 3, 4] or None
-        Transforms of the training views, for a recipe with given exposures.
+        Transforms of the training views, for a recipe with fixed exposures.
     progress_every : int
         Iterations between Progress events. The last iteration of a stage always sends one.
     stage2_cache_bytes : int
@@ -373,8 +373,8 @@ class Trainer:
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """Yield the inner sum of E_i [N] for each training view of this process."""
         for index in self.processes.part(range(len(self.scene.train))):
-            found = self._whole.errors(self.state, index, self.drawn, self.settings, occlusion=occlusion)
-            yield found[: len(self.state.splats)]
+            errors = self._whole.errors(self.state, index, self.drawn, self.settings, occlusion=occlusion)
+            yield errors[: len(self.state.splats)]
 
     def _finish(self, stage: Stage) -> None:
         """Move the state to the next stage and send the event that this one is done."""
@@ -394,12 +394,12 @@ class Trainer:
         if frozen or self.protocol.near_plane_policy == "draw":
             return 0
         views = self.processes.part(self.scene_now().train)
-        seen = self.processes.any(visible_mask(self.state.splats, views, self.settings, self.backend))
-        unseen = int((~seen).sum())
+        visible = self.processes.any(visible_mask(self.state.splats, views, self.settings, self.backend))
+        unseen = int((~visible).sum())
         if unseen == len(self.state.splats):
             return 0  # an empty scene cannot be evaluated
         if unseen:
-            keep_rows(self.state, seen)
+            keep_rows(self.state, visible)
         return unseen
 
     def _progress(

@@ -85,13 +85,13 @@ class WholeSteps:
         return None if losses.smooth_normals and losses.normals is None else losses
 
     def _learned(self, state: TrainState, iteration: int) -> dict[str, Learned]:
-        rates, stage, found = lr_at(self._stage.lr, iteration, self._whole.scene.extent), self._stage, {}
+        rates, stage, learned = lr_at(self._stage.lr, iteration, self._whole.scene.extent), self._stage, {}
         for name, parameter in state.splats.items():
             if name in stage.train and parameter.numel() > 0:
                 moments, group = state.moments[name], stage.train[name]
                 trained = None if group == "all" else state.groups[group]
-                found[name] = Learned(moments.mean, moments.square, rates[name], moments.steps + 1, trained)
-        return found
+                learned[name] = Learned(moments.mean, moments.square, rates[name], moments.steps + 1, trained)
+        return learned
 
     def _settings_at(self, iteration: int, *, opaque: bool) -> RasterSettings:
         """Return the rasterizer settings; the same object while they are equal."""

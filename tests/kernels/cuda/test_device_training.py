@@ -331,7 +331,7 @@ def test_images_are_stored_as_bytes_and_convert_to_the_targets_of_the_cpu() -> N
             assert (target.mask is None) == (expected.mask is None)
             assert target.mask is None or torch.equal(target.mask, expected.mask)  # type: ignore[arg-type]
     assert pinned == [72, 24]  # the third view's image and mask; the fourth does not fit and is read each time
-    assert sorted(targets._kept) == [0, 1, 2]
+    assert sorted(targets._cached) == [0, 1, 2]
 
 
 def test_a_state_on_a_device_is_saved_in_host_memory_and_moves_completely() -> None:

@@ -48,7 +48,7 @@ def connected(backend: str) -> Iterator[ProcessGroup]:
         raise
     except Exception as error:
         if not together.announce():
-            raise LostContactError(str(error), told=True) from error
+            raise LostContactError(str(error), reported=True) from error
         if isinstance(error, Gs2dError) and not place.leads:
             error.args = (f"process {place.rank} of {place.size}: {error}", *error.args[1:])
         raise
@@ -66,7 +66,7 @@ def _connect(place: ProcessRank, backend: str) -> ProcessGroup:
             f"each process needs a GPU of its own, got {place.local_size} processes and {count} GPUs on this machine; "
             f"use torchrun --nproc-per-node {count}, or --backend cpu"
         )
-        raise BackendError(message) if place.local_rank == 0 else LostContactError(message, told=True)
+        raise BackendError(message) if place.local_rank == 0 else LostContactError(message, reported=True)
     if on_gpu:
         torch.cuda.set_device(place.local_rank)
     both = on_gpu and torch.distributed.is_nccl_available()
@@ -81,7 +81,7 @@ def lead(loaded: LoadedRun, together: ProcessGroup, on_event: OnEvent) -> Loaded
     rates = loaded.recipe.stages[0].lr
     rate = rates.for_views(together.size).sh0 / rates.sh0
     on_event(Notice(f"{together.size} processes: {together.size} views per iteration, learning rates times {rate:.3g}"))
-    together.tell({"scene": str(loaded.resolved.scene.path), "facts": _shared_facts(loaded)})
+    together.broadcast({"scene": str(loaded.resolved.scene.path), "facts": _shared_facts(loaded)})
     return replace(loaded, processes=together.size)
 
 
@@ -90,7 +90,7 @@ def follow(options: TrainOptions, together: ProcessGroup) -> RunFolder:
 
     Raises RunError if this process would train something else, LostContactError if process 0 has ended.
     """
-    sent: dict[str, Any] = together.tell({})
+    sent: dict[str, Any] = together.broadcast({})
     loaded = prepare_run(replace(options, scene=Path(sent["scene"])), ignore)
     for name, value in _shared_facts(loaded).items():
         if sent["facts"][name] != value:
@@ -106,7 +106,7 @@ def follow(options: TrainOptions, together: ProcessGroup) -> RunFolder:
         options=TrainerOptions(progress_every=progress_every(loaded), processes=together),
     )
     signals = HeldSignals()
-    together.hears = lambda: signals.pending
+    together.stop_requested = lambda: signals.pending
     signals.hold()  # process 0 decides when to stop; a second signal acts at once
     try:
         trainer.run()

@@ -157,7 +157,7 @@ class RunLogger:
     def stop_if_requested(self) -> None:
         """Save a checkpoint and stop, if a signal requests it and training can resume from this iteration."""
         state, processes = self._state, self._trainer.processes
-        if not (self._signals.pending or processes.stop_asked) or not state.entered:
+        if not (self._signals.pending or processes.stops) or not state.entered:
             return
         if state.step == self._stage(state.stage).iterations:
             return  # the checkpoint at the end of the stage is due
@@ -168,7 +168,7 @@ class RunLogger:
             except Gs2dError as error:
                 self._on_event(Notice(f"no checkpoint at iteration {state.step}: {error}"))
         self._signals.release()
-        if processes.stop_asked:  # another process received the signal
+        if processes.stops:  # another process received the signal
             raise KeyboardInterrupt
 
     @contextmanager

@@ -90,5 +90,5 @@ def densifier_of(densify: GradDensify | Densify | None, surroundings: Surroundin
     if isinstance(densify, GradDensify):
         densify = Densify("gradient", vars(densify))
     where, options = f"stage {surroundings.stage!r}: ", densify.options
-    made: Densifier = DENSIFIERS.make(densify.name, surroundings, options=options, where=where)
-    return made
+    densifier: Densifier = DENSIFIERS.make(densify.name, surroundings, options=options, where=where)
+    return densifier

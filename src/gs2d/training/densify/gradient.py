@@ -1,6 +1,6 @@
 """Densification by screen gradients: clone, split, prune, opacity reset (official 2DGS), and its AbsGS form.
 
-The screen-size prune of the official code never acts (its statistic is zeroed just before the test); it is left out.
+The screen-size prune of the official code never acts (its statistic is zeroed just before the test); it is omitted.
 """
 
 from __future__ import annotations
@@ -209,9 +209,9 @@ def _select(
     stays = ~(faint | large)
     to_clone, to_split = to_clone & stays, to_split & ~faint  # splats that are pruned at once take no room
     growth = torch.where(to_split, CHILDREN - stays.long(), to_clone.long())  # [N] rows gained
-    wanted = urgency.where(growth > 0, -torch.ones_like(urgency))
-    order = torch.sort(wanted, descending=True, stable=True).indices
-    chosen = torch.zeros_like(wanted, dtype=torch.bool)
+    priority = urgency.where(growth > 0, -torch.ones_like(urgency))
+    order = torch.sort(priority, descending=True, stable=True).indices
+    chosen = torch.zeros_like(priority, dtype=torch.bool)
     chosen[order] = growth[order].cumsum(0) <= densify.max_splats - stays.sum()
     return to_clone & chosen, to_split & chosen
 

@@ -59,17 +59,17 @@ class CameraIntrinsics(LearnedQuantity):
             return None
         if numbers.grad is None:  # no splat is in the image
             return torch.zeros(3, dtype=torch.float64)
-        given, share = self.views[index].camera, camera.width / self.views[index].camera.width
+        original, share = self.views[index].camera, camera.width / self.views[index].camera.width
         fx, fy, cx, cy = numbers.grad.tolist()
         moves = float(self.principal_point)
-        moved = [moves * share * cx * given.fx, moves * share * cy * given.fy]
+        moved = [moves * share * cx * original.fx, moves * share * cy * original.fy]
         return torch.tensor([fx * camera.fx + fy * camera.fy, *moved], dtype=torch.float64)
 
     def place(self, values: Tensor, scene: Scene) -> Scene:
         """Return the scene with the learned intrinsics, also for test views that share a camera."""
         of_camera = {view.file_intrinsics(): self.zoom(values, k) for k, view in enumerate(scene.train)}
-        known = {v.name: of_camera[v.file_intrinsics()] for v in scene.views if v.file_intrinsics() in of_camera}
-        return scene.with_poses({}, known)
+        zooms = {v.name: of_camera[v.file_intrinsics()] for v in scene.views if v.file_intrinsics() in of_camera}
+        return scene.with_poses({}, zooms)
 
     @classmethod
     def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:

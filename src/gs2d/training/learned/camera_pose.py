@@ -35,12 +35,12 @@ class CameraPose(LearnedQuantity):
 
     def __init__(self, settings: Quantity, scene: Scene) -> None:
         super().__init__(settings, scene)
-        self.given = np.stack([view.camera.T_cam_world for view in scene.train])
+        self.initial = np.stack([view.camera.T_cam_world for view in scene.train])
         self.extent = scene.extent
 
     @cached_property
     def _by_similarity(self) -> np.ndarray:
-        return similarity_motions(self.given, self.extent)
+        return similarity_motions(self.initial, self.extent)
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
         """Return the motion of a camera [6]: rotation vector, rad, and shift, world units."""
@@ -50,7 +50,7 @@ class CameraPose(LearnedQuantity):
 
     def pose(self, values: Tensor, index: int) -> Tensor:
         """Return T_cam_world of a camera [4, 4] float64, a new tensor."""
-        return se3_exp(self.numbers(values, index)) @ torch.from_numpy(self.given[index])
+        return se3_exp(self.numbers(values, index)) @ torch.from_numpy(self.initial[index])
 
     def camera(self, values: Tensor, index: int, camera: Camera, *, learns: bool) -> Camera:
         """Return the camera of a view at its pose; with ``learns``, the pose gets a gradient."""

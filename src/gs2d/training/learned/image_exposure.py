@@ -37,20 +37,20 @@ class ImageExposure(LearnedQuantity):
         self.learns = initial != "given"
         self._initial, self._scene = initial, scene
 
-    def begin(self, given: Tensor | None = None) -> Tensor:
+    def begin(self, previous: Tensor | None = None) -> Tensor:
         """Return theta [V, 3, 4]: zeros, gains of sparse points, or given transforms."""
         values = super().begin()
         if self._initial == "given":
-            if given is None or len(given) != len(values):
+            if previous is None or len(previous) != len(values):
                 raise RecipeError(
                     f"learned.exposure.options.initial=given needs {len(values)} transforms, one per view, got "
-                    f"{0 if given is None else len(given)}; only `gs2d blocks` sets it, use points or identity"
+                    f"{0 if previous is None else len(previous)}; only `gs2d blocks` sets it, use points or identity"
                 )
-            return given.detach().to(values) - identity(values)
-        found = point_gains(self._scene) if self._initial == "points" else None
-        if found is not None:
+            return previous.detach().to(values) - identity(values)
+        gains = point_gains(self._scene) if self._initial == "points" else None
+        if gains is not None:
             for channel in range(3):
-                values[:, channel, channel] = torch.as_tensor(found[:, channel] - 1)
+                values[:, channel, channel] = torch.as_tensor(gains[:, channel] - 1)
         return values
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
@@ -79,7 +79,7 @@ class ImageExposure(LearnedQuantity):
     @classmethod
     def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:
         """Return the brightness of each photograph relative to the mean."""
-        transforms = {view: found[name] for view, found in record["views"].items() if name in found}
+        transforms = {view: numbers[name] for view, numbers in record["views"].items() if name in numbers}
         gains = {view: exposure_gain(np.array(transform, np.float64)) for view, transform in transforms.items()}
         if not gains:
             return None

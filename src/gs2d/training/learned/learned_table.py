@@ -51,16 +51,16 @@ class LearnedTable:
         return {name: quantity.shape for name, quantity in self.quantities.items()}
 
     # -- rows ------------------------------------------------------------------------------------------------------
-    def start(self, like: Tensor, given: Mapping[str, Tensor | None]) -> dict[str, LearnedRows]:
-        """Return the initial rows; ``given`` are numbers of another training.
+    def start(self, like: Tensor, previous: Mapping[str, Tensor | None]) -> dict[str, LearnedRows]:
+        """Return the initial rows; ``previous`` are numbers of another training.
 
-        Raise RecipeError if a quantity needs given numbers for each view and does not get them.
+        Raise RecipeError if a quantity needs numbers of another training for each view, and they are missing.
         """
-        found = {}
+        rows = {}
         for name, quantity in self.quantities.items():
-            values = quantity.begin(given.get(name))
-            found[name] = LearnedRows.start(values.to(like) if quantity.on_device else values)
-        return found
+            values = quantity.begin(previous.get(name))
+            rows[name] = LearnedRows.start(values.to(like) if quantity.on_device else values)
+        return rows
 
     def check(self, rows: Rows) -> None:
         """Raise RunError unless there are rows of each quantity, and no others."""
@@ -82,11 +82,11 @@ class LearnedTable:
     def learning(self, stage: int, iteration: int) -> dict[str, float]:
         """Return the learning rates of the quantities that an iteration (from 1) of a stage updates."""
         of_run = sum(earlier.iterations for earlier in self._stages[:stage]) + iteration
-        found = {}
+        rates = {}
         for name, quantity in self.quantities.items():
             if quantity.learns and (self._stages[stage].moves_all or not quantity.needs_moving_splats):
-                found[name] = quantity.settings.rate_at(of_run)
-        return {name: rate for name, rate in found.items() if rate > 0}
+                rates[name] = quantity.settings.rate_at(of_run)
+        return {name: rate for name, rate in rates.items() if rate > 0}
 
     def update(
         self, rows: Rows, index: int, gradients: Mapping[str, Tensor], rates: Mapping[str, float], backend: Backend
@@ -111,18 +111,18 @@ class LearnedTable:
                 rows[name].steps[self.quantities[name].row_of[index]] -= 1
 
     # -- one view ----------------------------------------------------------------------------------------------------
-    def camera(self, rows: Rows, index: int, given: Camera, learning: Collection[str] = ()) -> Camera:
+    def camera(self, rows: Rows, index: int, camera: Camera, learning: Collection[str] = ()) -> Camera:
         """Return the current camera of a training view, with gradients for the quantities in ``learning``."""
         for name, quantity in self.quantities.items():
-            given = quantity.camera(rows[name].values, index, given, learns=name in learning)
-        return given
+            camera = quantity.camera(rows[name].values, index, camera, learns=name in learning)
+        return camera
 
     def leaves(self, rows: Rows, index: int, camera: Camera, like: Tensor) -> dict[str, Tensor]:
         """Return the tensors that ``shown`` applies to a rendering, as leaves of autograd."""
-        found = {
+        leaves = {
             name: quantity.leaf(rows[name].values, index, camera, like) for name, quantity in self.quantities.items()
         }
-        return {name: leaf for name, leaf in found.items() if leaf is not None}
+        return {name: leaf for name, leaf in leaves.items() if leaf is not None}
 
     def numbers(self, rows: Rows, index: int, like: Tensor) -> dict[str, Tensor]:
         """Return the numbers of a view that change colours."""
@@ -134,13 +134,13 @@ class LearnedTable:
 
     def penalties(self, leaves: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
         """Return the terms of the loss on the numbers of a view."""
-        found = {name: self.quantities[name].penalty(leaf, index) for name, leaf in leaves.items()}
-        return {name: term for name, term in found.items() if term is not None}
+        terms = {name: self.quantities[name].penalty(leaf, index) for name, leaf in leaves.items()}
+        return {name: term for name, term in terms.items() if term is not None}
 
     def gradients(self, leaves: Mapping[str, Tensor], index: int, camera: Camera) -> dict[str, Tensor]:
         """Return the gradients of the rows of a view, after the backward pass."""
-        found = {name: quantity.gradient(leaves.get(name), index, camera) for name, quantity in self.quantities.items()}
-        return {name: gradient for name, gradient in found.items() if gradient is not None}
+        rows = {name: quantity.gradient(leaves.get(name), index, camera) for name, quantity in self.quantities.items()}
+        return {name: gradient for name, gradient in rows.items() if gradient is not None}
 
     # -- after training ------------------------------------------------------------------------------------------------
     def scene_now(self, rows: Rows) -> Scene:
@@ -158,8 +158,8 @@ def first_not_finite_quantity(tensors: Mapping[str, Tensor], *, waits: bool) -> 
 
     ``waits``: also read tensors on a GPU.
     """
-    seen = ((name, tensor) for name, tensor in tensors.items() if waits or tensor.device.type == "cpu")
-    return next((name for name, tensor in seen if not finite(tensor)), None)
+    readable = ((name, tensor) for name, tensor in tensors.items() if waits or tensor.device.type == "cpu")
+    return next((name for name, tensor in readable if not finite(tensor)), None)
 
 
 def _appearances(name: str, quantity: LearnedQuantity, values: Tensor, scene: Scene) -> dict[str, Appearance]:
@@ -167,10 +167,10 @@ def _appearances(name: str, quantity: LearnedQuantity, values: Tensor, scene: Sc
     index_of = {view.name: index for index, view in enumerate(scene.train)}
     if quantity.per_camera:
         first = {view.file_intrinsics(): index for index, view in reversed(list(enumerate(scene.train)))}
-        known = ((view.name, first.get(view.file_intrinsics())) for view in scene.views)
-        index_of = {view: index for view, index in known if index is not None}
+        shared = ((view.name, first.get(view.file_intrinsics())) for view in scene.views)
+        index_of = {view: index for view, index in shared if index is not None}
     numbers = {view: quantity.numbers(values, index) for view, index in index_of.items()}
-    return {view: {name: found.detach().double().numpy()} for view, found in numbers.items()}
+    return {view: {name: row.detach().double().numpy()} for view, row in numbers.items()}
 
 
 # -- colours --------------------------------------------------------------------------------------------------------
@@ -181,8 +181,8 @@ def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | No
     most 1.
     """
     quantities = _ordered(numbers)
-    for quantity, found in quantities:
-        color = quantity.apply(color, found, at)
+    for quantity, values in quantities:
+        color = quantity.apply(color, values, at)
     if clipped is None or not any(quantity.changes_color for quantity, _ in quantities):
         return color
     return torch.where(clipped & (color.detach() > 1), 1.0, color)
@@ -194,20 +194,20 @@ def shown_splats(splats: Splats, camera: Camera, numbers: Numbers, sh_degree: in
     center = torch.as_tensor(camera.center).to(splats.means)
     directions = torch.nn.functional.normalize(splats.means - center, dim=1)
     rgb = sh_to_rgb(splats.sh0, splats.shN, directions, min(sh_degree, splats.sh_degree))  # [N, 3]
-    seen = shown(rgb[None], numbers, ImagePoints(camera, points=splats.means))[0]
-    return Splats(**(dict(splats.items()) | {"sh0": rgb_to_sh0(seen)}))
+    color = shown(rgb[None], numbers, ImagePoints(camera, points=splats.means))[0]
+    return Splats(**(dict(splats.items()) | {"sh0": rgb_to_sh0(color)}))
 
 
 def unshown(color: Tensor, numbers: Numbers, at: ImagePoints) -> Tensor:
     """Return colours [H, W, 3] of an image as the scene has them: the inverse of :func:`shown`."""
-    for quantity, found in reversed(_ordered(numbers)):
-        color = quantity.undo(color, found, at)
+    for quantity, values in reversed(_ordered(numbers)):
+        color = quantity.undo(color, values, at)
     return color
 
 
 def numbers_of(view: View, like: Tensor) -> dict[str, Tensor]:
     """Return the numbers of the appearance of a view, with the dtype and device of ``like``."""
-    return {name: torch.as_tensor(found).to(like) for name, found in view.appearance.items()}
+    return {name: torch.as_tensor(values).to(like) for name, values in view.appearance.items()}
 
 
 def _ordered(numbers: Numbers) -> list[tuple[type[LearnedQuantity], Tensor]]:

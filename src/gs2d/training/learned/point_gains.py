@@ -64,11 +64,11 @@ def _fitted(views: np.ndarray, points: np.ndarray, values: np.ndarray, count: in
     logs, weights = np.zeros((count, 3)), np.ones(len(values))
     for _ in range(ROUNDS):
         colors = _means(points, values - logs[views], weights, int(points.max()) + 1)
-        left = values - colors[points]
-        logs = _means(views, left, weights, count)
+        residual = values - colors[points]
+        logs = _means(views, residual, weights, count)
         logs[np.bincount(views, minlength=count) < MIN_COLORS] = 0.0
         logs -= logs.mean(axis=0)
-        error = np.abs(left - logs[views]).mean(axis=1)
+        error = np.abs(residual - logs[views]).mean(axis=1)
         weights = 1 / (1 + (error / OUTLIER) ** 2)
     return np.exp(logs)
 

@@ -43,9 +43,9 @@ def predicted_exposures(scene: Scene, brightness: Callable[[View], float] | None
     trust = _trust(around @ greys, greys)
     meter = None
     if brightness is not None and len(cameras) >= ENOUGH:
-        seen = np.array([brightness(view) for view in scene.train])
-        meter = _Meter.fitted(seen, 1 + greys / GREY, around, trust)
-    found = {}
+        measured = np.array([brightness(view) for view in scene.train])
+        meter = _Meter.fitted(measured, 1 + greys / GREY, around, trust)
+    exposures = {}
     for view in scene.test:
         weights = _weights(view.camera, cameras, scene.extent)
         mean = (torch.from_numpy(weights)[:, None, None] * offsets).sum(dim=0)
@@ -53,8 +53,8 @@ def predicted_exposures(scene: Scene, brightness: Callable[[View], float] | None
         if meter is not None and brightness is not None:
             own = 1 + float((GREY * transform[:, :3].sum(dim=1) + transform[:, 3] - GREY).mean()) / GREY
             transform = transform * (meter.gain(brightness(view), weights) / max(own, LEAST_GAIN))
-        found[view.name] = transform.numpy()
-    return found
+        exposures[view.name] = transform.numpy()
+    return exposures
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,11 @@ class _Meter:
         return cls(level, slope, middle, residuals, own) if residual < MAX_VARIANCE * by_neighbours else None
 
 
-def _trust(predicted: np.ndarray, found: np.ndarray) -> float:
+def _trust(predicted: np.ndarray, actual: np.ndarray) -> float:
     """Return the least-squares factor of a prediction over training views, each left out, clipped to [0, 1]."""
-    if len(found) < 3:
+    if len(actual) < 3:
         return 0.0
-    return float(np.clip((predicted @ found) / max(predicted @ predicted, 1e-12), 0.0, 1.0))
+    return float(np.clip((predicted @ actual) / max(predicted @ predicted, 1e-12), 0.0, 1.0))
 
 
 def _weights(camera: Camera, cameras: Sequence[Camera], extent: float, *, without: int | None = None) -> np.ndarray:

@@ -26,7 +26,7 @@ class ImagePoints:
 
     camera: Camera
     coverage: Tensor | None = None  # [H, W]: alpha of the image; None: 1 everywhere
-    background: Tensor | None = None  # [3]: background colour; given with ``coverage``
+    background: Tensor | None = None  # [3]: background colour; set with ``coverage``
     # [N, 3]: centres of splats; the colours are then [1, N, 3]. None: the colours are an image [H, W, 3].
     points: Tensor | None = None
 
@@ -89,16 +89,16 @@ class LearnedQuantity:
         self.views: Sequence[View] = scene.train
         self.row_of = list(range(len(scene.train)))
         if self.per_camera:
-            known = {k: row for row, k in enumerate(dict.fromkeys(view.file_intrinsics() for view in scene.train))}
-            self.row_of = [known[view.file_intrinsics()] for view in scene.train]
+            rows = {k: row for row, k in enumerate(dict.fromkeys(view.file_intrinsics() for view in scene.train))}
+            self.row_of = [rows[view.file_intrinsics()] for view in scene.train]
 
     @property
     def rows(self) -> int:
         """Number of rows."""
         return max(self.row_of) + 1
 
-    def begin(self, given: Tensor | None = None) -> Tensor:
-        """Return the initial rows [G, ...]; ``given`` are numbers of another training."""
+    def begin(self, previous: Tensor | None = None) -> Tensor:
+        """Return the initial rows [G, ...]; ``previous`` are numbers of another training."""
         return torch.zeros(self.rows, *self.shape, dtype=torch.float64)
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
@@ -180,10 +180,10 @@ class LearnedQuantity:
         QuantityReport or None
             Default: each number by photograph; the root mean square instead of more than ``MOST_CURVES`` numbers.
         """
-        found = [np.ravel(numbers[name]) for numbers in record["views"].values() if name in numbers]
-        if not found:
+        vectors = [np.ravel(numbers[name]) for numbers in record["views"].values() if name in numbers]
+        if not vectors:
             return None
-        rows = np.array(found, np.float64)
+        rows = np.array(vectors, np.float64)
         text = f"Numbers of {len(rows)} photographs, from {rows.min():.3g} to {rows.max():.3g}."
         if rows.shape[1] > MOST_CURVES:
             return QuantityReport(text, {"root mean square": np.sqrt(np.square(rows).mean(axis=1)).tolist()})

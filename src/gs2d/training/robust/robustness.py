@@ -82,8 +82,8 @@ class Robustness:
     together. Process 0 makes the start and the trials for all. ``frozen``: further splats of the scene, which are not
     trained. ``sweep``: plane sweep of the scene with the settings of the recipe, if it is there already.
 
-    The constructor raises DataError if floaters are to be removed and the capture lacks sparse points and the images
-    that show them, or if a required dense start finds nothing. ``scene`` has the points that training starts from;
+    The constructor raises DataError if floaters are to be removed and the capture does not list sparse points and their
+    images, or if a required dense start finds nothing. ``scene`` has the points that training starts from;
     ``start_failure`` is the reason if an optional dense start failed, else empty.
     """
 

@@ -34,15 +34,15 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 
-WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are made anew: the surface must be there
-CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny things have matt-looking spots
+WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are recomputed: the surface must be there
+CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny surfaces have matt-looking spots
 TINY = 1e-12
 WORKERS = 4  # threads; those of the library come on top
 LEAST = 0.05  # mean weight below which a cell is matt: no texture, which flatness handles
 
 
 def is_due(stage: Stage, iteration: int) -> bool:
-    """Return whether the maps are made at the end of an iteration (1-based) of a stage."""
+    """Return whether the maps are computed at the end of an iteration (1-based) of a stage."""
     return stage.moves_all and iteration in {round(part * stage.iterations) for part in WHEN}
 
 

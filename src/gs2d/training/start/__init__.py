@@ -1,1 +1,1 @@
-"""The splats that training starts from: sparse, swept, known or random points."""
+"""The splats that training starts from: sparse, swept or random points, or points on depth maps."""

@@ -1,4 +1,4 @@
-"""Splats on a sphere around the scene, to start from where no depth is known.
+"""Splats on a sphere around the scene, to start from where the depth is unknown.
 
 Behind a subject there are walls, people and sky in few images, where sparse points and a plane sweep find nothing.
 Without a splat there is no gradient that could create one. A few large splats far away are enough to begin with;
@@ -20,7 +20,7 @@ from gs2d.training.start.plane_sweep import Sweep, project, unproject
 SPLATS = 500  # on the whole sphere; more of them would overfit the background of each image (notebook/floaters.md)
 RADIUS = 3.0  # of the sphere, in units of the scene's reach: its cameras and nearly all sparse and swept points
 SIZE = 0.8  # standard deviation of a splat, in units of the distance between neighbours
-BESIDE_KNOWN = 3  # px: nearer to a pixel of known depth, a pixel probably shows the same surface
+BESIDE_DEPTH = 3  # px: nearer to a pixel with a depth, a pixel probably shows the same surface
 MAX_VIEWS = 200  # images that are used, evenly chosen
 STRIDE = 5  # px between swept points that estimate the reach of the scene
 
@@ -28,7 +28,7 @@ STRIDE = 5  # px between swept points that estimate the reach of the scene
 def sphere_points(scene: Scene, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return positions, colours in [0, 1], normals (all [P, 3]) and sizes [P] of splats around the scene.
 
-    Positions that no image shows in a pixel of unknown depth are left out; a colour is the median of such pixels. There
+    Positions that no image shows in a pixel of unknown depth are omitted; a colour is the median of such pixels. There
     are none for images with an alpha channel.
 
     Parameters
@@ -69,7 +69,7 @@ def _swept_places(sweep: Sweep, sampled: Sequence[int]) -> np.ndarray:
 
 def _unknown(sweep: Sweep, index: int) -> np.ndarray:
     """Return the pixels [H, W] of a downscaled image with unknown depth."""
-    covered = binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
+    covered = binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_DEPTH)
     return np.asarray(sweep.views[index].usable & ~covered)
 
 

@@ -260,7 +260,7 @@ def _shared(rows: Sequence[np.ndarray]) -> Any:
     """Return the number of points that each two views share, sparse [V, V]; ``rows`` are the points of each view."""
     from scipy.sparse import csr_matrix
 
-    ends = np.cumsum([0, *(len(found) for found in rows)])
+    ends = np.cumsum([0, *map(len, rows)])
     points = np.concatenate(rows)
     shows = csr_matrix(
         (np.ones(len(points), dtype=np.int64), points, ends), shape=(len(rows), points.max(initial=0) + 1)
@@ -365,11 +365,11 @@ def _blurred(image: Tensor, radius: int) -> Tensor:
 
 def project(view: SmallView, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return depth, clipped column and clipped row of points [..., 3] in a view, and which are inside."""
-    seen = places @ view.T[:3, :3].T + view.T[:3, 3]
-    z = seen[..., 2]
+    local = places @ view.T[:3, :3].T + view.T[:3, 3]
+    z = local[..., 2]
     front = np.maximum(z, 1e-12)
-    x = view.K[0, 0] * seen[..., 0] / front + view.K[0, 2]
-    y = view.K[1, 1] * seen[..., 1] / front + view.K[1, 2]
+    x = view.K[0, 0] * local[..., 0] / front + view.K[0, 2]
+    y = view.K[1, 1] * local[..., 1] / front + view.K[1, 2]
     height, width = view.size
     inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     column = np.clip(np.nan_to_num(x), 0, width - 1).astype(np.int64)

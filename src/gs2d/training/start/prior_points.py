@@ -1,4 +1,4 @@
-"""Points on known depth maps, to start from."""
+"""Start points on the depth maps of a capture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gs2d.losses.prior_formulas import MetricDepth
 
 
 def with_prior_points(scene: Scene, recipe: Recipe) -> Scene:
-    """Return the scene with points on its known depth maps, if the recipe has a depth prior that adds them.
+    """Return the scene with points on its depth maps, if the recipe has a depth prior that adds them.
 
     They are the points of about ``init_points`` random pixels of all training views. Splats move only a few percent of
     the extent, so walls far from any sparse point need splats to start from. The normals are those of planes through
@@ -41,7 +41,7 @@ def with_prior_points(scene: Scene, recipe: Recipe) -> Scene:
         points.append((local - view.camera.T_cam_world[:3, 3]) @ view.camera.rotation)
         colors.append(view.image()[rows, columns, :3])
         normals.append(plane_normals(points[-1]))  # within one map, because maps may contradict each other
-    if not any(len(found) for found in points):
+    if not any(map(len, points)):
         return scene
     if scene.points is not None:
         grey = np.full((len(scene.points), 3), 128, dtype=np.uint8)
