@@ -29,7 +29,7 @@ LATER = {  # steps after training, with the result that is missing if they fail
     "finish.run_verdict.Collector._measure": "verdict.json",
     "train.train_run.meshed_subject": "mesh.ply",
     "train.train_run.extract_mesh": "mesh.ply",
-    "train.train_run.keep_facts": "mesh.ply",
+    "train.train_run.write_mesh_metrics": "mesh.ply",
     "train.train_run.page_run": "scene.html",
     "train.train_run.write_verdict": "verdict.json",
     "finish.run_report.report_run": "report.html",

@@ -108,25 +108,25 @@ def state_of(splats: Splats) -> TrainState:
 
 def version_of(live: Live) -> int:
     """Ask as a page does."""
-    return int(json.loads(bytes(live._answer_state({}).parts[0]))["version"])
+    return int(json.loads(bytes(live._state_response({}).parts[0]))["version"])
 
 
 def test_the_page_shows_a_copy_of_the_splats(live: Live, splats: Splats) -> None:
     assert version_of(live) == 0
     with pytest.raises(DataError, match="there are no splats yet"):
-        live._answer_splats({})
+        live._splats_response({})
     before = splats.means.clone()
     live.on_training_event(StageEntering("surface", 0, len(splats)), state_of(splats), None)  # not trained yet
     assert version_of(live) == 0
     live.on_training_event(progress(), state_of(splats), None)
     splats.means += 100.0  # training continues at once
     assert version_of(live) == 1
-    answer = live._answer_splats({})
+    answer = live._splats_response({})
     count = json.loads(answer.headers["X-Splats"])["splats"]
     words = np.frombuffer(answer.parts[0], np.float32).reshape(count, 8)
     for mean in words[:, :3] + live._scene.focus:
         assert np.abs(before.numpy() - mean).max(axis=1).min() < 1e-4
-    assert bytes(live._answer_splats({}).parts[0]) == bytes(answer.parts[0])  # another page gets the same
+    assert bytes(live._splats_response({}).parts[0]) == bytes(answer.parts[0])  # another page gets the same
 
 
 def test_splats_are_copied_only_for_an_open_page_after_the_previous_copy_was_fetched(
@@ -137,14 +137,14 @@ def test_splats_are_copied_only_for_an_open_page_after_the_previous_copy_was_fet
     live.on_training_event(progress(), state_of(splats), None)
     assert version_of(live) == 1
     assert live._copy_at == math.inf
-    live._answer_splats({})
+    live._splats_response({})
     assert live._copy_at - time.monotonic() == pytest.approx(module.MIN_SECONDS, abs=1.0)
     live.on_training_event(progress(20), state_of(splats), None)
     assert version_of(live) == 1
     live._copy_at = 0.0
     live.on_training_event(progress(20), state_of(splats), None)
     assert version_of(live) == 2
-    live._answer_splats({})
+    live._splats_response({})
     live._copy_at = 0.0
     monkeypatch.setattr(module, "WATCHED", -1.0)  # the last question is too long ago
     live.on_training_event(progress(30), state_of(splats), None)

@@ -153,11 +153,11 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
     """Return the contents of ``poses.json``; raise RunError if other photographs or options made it."""
     poses, requested = read_json(capture / POSES_JSON), requested_options(poses_options(options))
     try:
-        made = {"photos": poses["photos"], **poses["requested"]}
-        wanted = {"photos": str(options.photos.resolve()), **requested}
-        if made != wanted:
+        stored = {"photos": poses["photos"], **poses["requested"]}
+        requested = {"photos": str(options.photos.resolve()), **requested}
+        if stored != requested:
             raise RunError(
-                f"{capture} was made with other options{difference(made, wanted)}; resume with the same, or start "
+                f"{capture} was made with other options{difference(stored, requested)}; resume with the same, or start "
                 "again with --overwrite"
             )
         if options.photos.is_dir():  # it is no longer needed and may be gone

@@ -46,44 +46,44 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score the splats of a run, and its mesh if there is a true surface; update metrics, verdict and report."""
 
-    def tell(text: str) -> None:
+    def report(text: str) -> None:
         on_event(Notice(text))
 
     check_thresholds(options.thresholds)
-    wanted = options.matched
+    comparisons = options.matched
     path, named = Path(path), options.ground_truth
-    truth = None if named is None or named.is_dir() else choose_truth(named, named.parent, tell)
+    truth = None if named is None or named.is_dir() else choose_truth(named, named.parent, report)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, trained = open_finished(path, threads, on_event)
     lpips = None if lpips is None else lpips.to(trained.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
     if truth is None and trained.scene.root is not None:
-        truth = choose_truth(named, trained.scene.root, tell)
+        truth = choose_truth(named, trained.scene.root, report)
     has_mesh = run.file(MESH).exists()
     if truth is not None and not has_mesh and named is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     matched: dict[str, ImageMetrics] = {}
 
-    def match(seen: RenderedPhotograph, _: ImageMetrics) -> None:
-        if seen.split == "test":
-            image = matched_by_halves(seen, trained.settings.background)
-            matched[seen.view.name] = image_metrics(image, seen.target, seen.mask, backend=trained.backend, lpips=lpips)
+    def match(pair: RenderedPhotograph, _: ImageMetrics) -> None:
+        if pair.split == "test":
+            image = matched_by_halves(pair, trained.settings.background)
+            matched[pair.view.name] = image_metrics(image, pair.target, pair.mask, backend=trained.backend, lpips=lpips)
 
     shown, collected = predicted(trained), Collector(trained.scene)
-    visitors = [collected.visit, match] if "exposure" in wanted else [collected.visit]
+    visitors = [collected.visit, match] if "exposure" in comparisons else [collected.visit]
     for split, views in (("train", shown.scene.train), ("test", shown.scene.test)):
         scores = score_views(trained, views, on_event, split=split, lpips=lpips, visitors=visitors)
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
-    if "exposure" in wanted:
+    if "exposure" in comparisons:
         result |= split_metrics(matched, "test_matched", "test")
-    if "poses" in wanted:
+    if "poses" in comparisons:
         best = tuple(aligned(trained, shown.scene.test, on_event))
         result |= split_metrics(score_views(trained, best, on_event, lpips=lpips), "test_aligned", "test")
     if truth is not None and has_mesh:
         mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds
         on_event(Phase("scoring the surface", 0))
-        result["surface"] = score_surface(mesh, truth, trained.scene, folder=folder, tell=tell, thresholds=thresholds)
+        result["surface"] = score_surface(mesh, truth, trained.scene, folder=folder, tell=report, thresholds=thresholds)
     elif truth is not None:
         on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():
@@ -97,28 +97,28 @@ def evaluate_run(
     return result
 
 
-def matched_by_halves(seen: RenderedPhotograph, background: tuple[float, float, float]) -> Tensor:
+def matched_by_halves(rendered: RenderedPhotograph, background: tuple[float, float, float]) -> Tensor:
     """Return a rendering with its colours matched to the photograph.
 
     Each half gets the transform that fits the other half best (least squares), so that no pixel is matched to itself.
     """
-    view, color, target, mask = seen.view, seen.output.color, seen.target, seen.mask
-    camera = replace(view, appearance={k: found for k, found in view.appearance.items() if k != "exposure"})
+    view, color, target, mask = rendered.view, rendered.output.color, rendered.target, rendered.mask
+    camera = replace(view, appearance={k: numbers for k, numbers in view.appearance.items() if k != "exposure"})
     color, cover = photographed(camera, color, background), over(view, color, background)
     usable = torch.ones_like(color[..., 0], dtype=torch.bool) if mask is None else mask.clone()
     if cover:
         usable &= cover[0] > 0
-    left = torch.zeros_like(usable)
-    left[:, : color.shape[1] // 2] = True
-    to_right = expose(color, fit_exposure(color, target, usable & left, *cover), *cover)
-    to_left = expose(color, fit_exposure(color, target, usable & ~left, *cover), *cover)
-    return torch.where(left[..., None], to_left, to_right)
+    left_half = torch.zeros_like(usable)
+    left_half[:, : color.shape[1] // 2] = True
+    to_right = expose(color, fit_exposure(color, target, usable & left_half, *cover), *cover)
+    to_left = expose(color, fit_exposure(color, target, usable & ~left_half, *cover), *cover)
+    return torch.where(left_half[..., None], to_left, to_right)
 
 
 def aligned(trained: Trained, views: Sequence[View], on_event: OnEvent) -> Iterator[View]:
     """Yield views with their cameras aligned to their photographs, by the photometric loss of the fixed splats.
 
-    Renderings have the appearance of the photographs, as far as it is known. Scores of aligned views measure the scene
+    Renderings have the appearance of the photographs, if it was learned. Scores of aligned views measure the scene
     apart from errors of its test cameras.
     """
     splats, settings, backend = trained.splats, trained.settings, trained.backend

@@ -68,7 +68,7 @@ def draw_stage(run: RunFolder, trained: Trained, stage: str, group: Tensor | Non
     """Write the images of one stage, the photographs, and the index of both, of a few test views (or training views).
 
     They are drawn with the appearance of their photographs, as far as the scene knows it. ``group`` [N] bool are the
-    high-error splats, once they are known.
+    high-error splats, once they are available.
     """
     scene, background = trained.scene, trained.settings.background
     split, every = ("test", scene.test) if scene.test else ("train", scene.train)
@@ -112,8 +112,8 @@ def draw_stage(run: RunFolder, trained: Trained, stage: str, group: Tensor | Non
 
 def camera_json(camera: Camera) -> dict[str, Any]:
     """Return a camera as JSON values, the keyword arguments of ``Camera``."""
-    facts = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return {**facts, "T_cam_world": camera.T_cam_world.tolist()}
+    intrinsics = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {**intrinsics, "T_cam_world": camera.T_cam_world.tolist()}
 
 
 def splatted(trained: Trained, values: Tensor, camera: Camera) -> np.ndarray:
@@ -152,7 +152,7 @@ def render_run(
     if video is not None:
         spare_photographs([video], "--video", trained.scene)
     folder = out or run.file(RENDERS) / kind
-    made = make_folder(folder)
+    created = make_folder(folder)
     with run.locked() if out is None else contextlib.nullcontext():
         if options.orbit and out is None:  # remove the frames of a longer video
             for old in folder.glob("[0-9]*.png"):
@@ -168,7 +168,7 @@ def render_run(
         except BaseException:  # a full disk, Ctrl-C: leave no partial set of images
             for image in written:
                 image.unlink(missing_ok=True)
-            remove_made(made)
+            remove_made(created)
             raise
         result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
         if video is None:

@@ -53,7 +53,7 @@ from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 ONE_SURFACE = 0.02  # of the depth; if mean and median differ by more, a pixel shows several surfaces
 SEVERAL = 0.25  # weight of such a pixel
 ERROR = 0.25  # px: half of a voxel on the surface; twice as much costs 3 % of the Chamfer distance
-KEPT = (  # facts of a mesh in metrics.json
+MESH_METRICS = (  # fields of a mesh in metrics.json
     *("vertices", "faces", "method", "voxel", "truncation", "depth_limit", "depth"),
     *("pixels", "faces_per_pixel"),
 )
@@ -331,7 +331,7 @@ def mesh_run(
         if run.metrics().get("surface"):  # scores of the previous mesh
             run.write_metrics({**run.metrics(), "surface": None})
             shutil.rmtree(run.file(SURFACE), ignore_errors=True)
-        keep_facts(run, result)
+        write_mesh_metrics(run, result)
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
             on_event(Notice(f"removed {TEXTURED}, which belonged to the previous mesh"))
@@ -339,9 +339,9 @@ def mesh_run(
     return result
 
 
-def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:
-    """Write the facts of a run's mesh into ``metrics.json``."""
-    run.write_metrics({**run.metrics(), "mesh": {name: result[name] for name in KEPT if name in result}})
+def write_mesh_metrics(run: RunFolder, result: Mapping[str, Any]) -> None:
+    """Write the figures of a run's mesh into ``metrics.json``."""
+    run.write_metrics({**run.metrics(), "mesh": {name: result[name] for name in MESH_METRICS if name in result}})
 
 
 # -- the mesh of a file of splats --------------------------------------------------------------------------------------

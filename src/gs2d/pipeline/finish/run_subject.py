@@ -78,8 +78,8 @@ def meshed_subject(
         f"--method {options.method}": not MESH_METHODS.get(options.method).bounded,
     }
     check_subject_box(chosen, others)
-    wanted = chosen is not None or (trained.protocol.fusion.subject and not any(others.values()))
-    if run is None and not wanted:
+    is_meshed = chosen is not None or (trained.protocol.fusion.subject and not any(others.values()))
+    if run is None and not is_meshed:
         return None
     subject = read_subject(run.path) if run is not None and chosen is None else None
     if subject is None:
@@ -87,7 +87,7 @@ def meshed_subject(
         on_event(Notice(subject_line(subject, meshed=chosen is not None or trained.protocol.fusion.subject)))
         if run is not None:
             write_json(run.file(SUBJECT), subject.to_json())
-    return subject if wanted and subject.kind == OBJECT else None
+    return subject if is_meshed and subject.kind == OBJECT else None
 
 
 def centers_inside(splats: Splats, box: Sequence[float], option: str) -> Tensor:
@@ -123,12 +123,12 @@ def sights(trained: Trained) -> list[Sight]:
     points = np.zeros((0, 3)) if trained.scene.points is None else np.asarray(trained.scene.points.points, np.float64)
     reach = surface_reach(trained)
     return [
-        _sight(camera := _small(view.camera), _depth(trained, camera), points, _kept(trained, view), reach)
+        _sight(camera := _small(view.camera), _depth(trained, camera), points, _voting_pixels(trained, view), reach)
         for view in some_views(trained.scene.train, MAX_VIEWS)
     ]
 
 
-def _kept(trained: Trained, view: View) -> np.ndarray | None:
+def _voting_pixels(trained: Trained, view: View) -> np.ndarray | None:
     """Return the pixels of a photograph that may vote, [H, W] bool, by its mask; None: all."""
     used = trained.scene.masks.found and trained.protocol.use_mask_in_training
     return view.mask() if used else None
@@ -146,12 +146,12 @@ def _depth(trained: Trained, camera: Camera) -> np.ndarray:
 
 
 def _sight(
-    camera: Camera, depth: np.ndarray, points: np.ndarray, kept: np.ndarray | None, reach: Reach | None
+    camera: Camera, depth: np.ndarray, points: np.ndarray, mask: np.ndarray | None, reach: Reach | None
 ) -> Sight:
-    """Return the votes of one camera; ``kept`` [H, W] bool, of any size, marks the pixels that may vote."""
+    """Return the votes of one camera; ``mask`` [H, W] bool, of any size, marks the pixels that may vote."""
     points = points[shown(camera, points)]
-    if kept is not None:
-        image = Image.fromarray(kept).resize((camera.width, camera.height), Image.Resampling.NEAREST)
+    if mask is not None:
+        image = Image.fromarray(mask).resize((camera.width, camera.height), Image.Resampling.NEAREST)
         small = np.asarray(image, dtype=bool)
         pixels = camera.project(points)[0].astype(np.int64)
         points = points[small[pixels[:, 1].clip(max=camera.height - 1), pixels[:, 0].clip(max=camera.width - 1)]]

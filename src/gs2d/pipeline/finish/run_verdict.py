@@ -94,28 +94,28 @@ class Collector:
         worst = max(shares, key=shares.__getitem__)
         return {"transparent": {"part": fmean(shares.values()), "view": worst, "worst": shares[worst]}}
 
-    def visit(self, seen: RenderedPhotograph, scores: ImageMetrics) -> None:
+    def visit(self, rendered: RenderedPhotograph, scores: ImageMetrics) -> None:
         """Measure a view."""
         if self.failure is not None:
             return
         try:
-            self._views[seen.view.name] = self._measure(seen, scores)
+            self._views[rendered.view.name] = self._measure(rendered, scores)
         except Exception as error:
             self.failure = error
 
-    def _measure(self, seen: RenderedPhotograph, scores: ImageMetrics) -> ViewMeasures:
-        view, psnr = seen.view, scores.psnr.value
+    def _measure(self, rendered: RenderedPhotograph, scores: ImageMetrics) -> ViewMeasures:
+        view, psnr = rendered.view, scores.psnr.value
         psnr = psnr if psnr is not None and math.isfinite(psnr) else None
-        measured = ViewMeasures(view.name, seen.split, psnr)
-        if seen.output.depth_transmittance is not None:
-            self._surfaces[view.name] = SurfaceSample.of(view.camera, seen.output)
-        if seen.split == "train" and view.alpha() is None:
-            alpha = seen.output.alpha if seen.mask is None else seen.output.alpha[seen.mask]
+        measured = ViewMeasures(view.name, rendered.split, psnr)
+        if rendered.output.depth_transmittance is not None:
+            self._surfaces[view.name] = SurfaceSample.of(view.camera, rendered.output)
+        if rendered.split == "train" and view.alpha() is None:
+            alpha = rendered.output.alpha if rendered.mask is None else rendered.output.alpha[rendered.mask]
             return replace(measured, transparent=float((alpha < CLEAR).double().mean()) if alpha.numel() else None)
-        if seen.split != "test" or self._observed is None:
+        if rendered.split != "test" or self._observed is None:
             return measured
         points = self._observed.in_view(view.name, view.camera)
-        hidden = hidden_points(seen.output.depth("median").cpu().numpy(), points)
+        hidden = hidden_points(rendered.output.depth("median").cpu().numpy(), points)
         return replace(measured, points=len(points.depth), hidden=int(hidden.sum()))
 
 

@@ -46,21 +46,21 @@ def score_views(
 ) -> dict[str, ImageMetrics]:
     """Return the image metrics of each view by its name; ``split`` is passed to the visitors.
 
-    Views are rendered with the appearance of their photographs, if known. Masked pixels are ignored.
+    Views are rendered with the appearance of their photographs, if learned. Masked pixels are ignored.
     """
-    rendered = _rendered(trained, views, split)
+    renderings = _rendered(trained, views, split)
     scores: dict[str, ImageMetrics] = {}
-    for seen in counted(rendered, f"scoring {split} views" if split else "scoring", len(views), on_event):
-        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=trained.backend, lpips=lpips)
-        scores[seen.view.name] = metrics
+    for rendered in counted(renderings, f"scoring {split} views" if split else "scoring", len(views), on_event):
+        metrics = image_metrics(rendered.image, rendered.target, rendered.mask, backend=trained.backend, lpips=lpips)
+        scores[rendered.view.name] = metrics
         for visit in visitors:
-            visit(seen, metrics)
+            visit(rendered, metrics)
     return scores
 
 
 def mean_psnr(trained: Trained, views: Sequence[View]) -> float | None:
     """Return the mean PSNR of views, of images that are not rounded to 8 bits."""
-    values = [psnr_float(seen.image, seen.target, seen.mask) for seen in _rendered(trained, views)]
+    values = [psnr_float(rendered.image, rendered.target, rendered.mask) for rendered in _rendered(trained, views)]
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 

@@ -46,10 +46,10 @@ def checked_layout(path: Path, out: Path, layout: str | None = None) -> str:
     return layout
 
 
-def splats_of(path: Path, tell: Tell) -> Splats:
-    """Return the splats of a finished run or of a file of flat splats; ``tell`` receives what a reader dropped."""
+def splats_of(path: Path, report: Tell) -> Splats:
+    """Return the splats of a finished run or of a file of flat splats; ``report`` receives notes of the reader."""
     if path.is_file():
-        return read_splats(path, tell)
+        return read_splats(path, report)
     run = open_run(path)
     run.sweep()
     return finished_splats(run)

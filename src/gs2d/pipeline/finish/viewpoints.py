@@ -114,7 +114,7 @@ def choose_viewpoints(splats: Splats, settings: RasterSettings, backend: Backend
     """Return cameras that show the subject of splats from all sides that can be seen.
 
     The subject is where the splats are densest. Cameras on a sphere around it look at its centre. If cameras in its
-    middle see about as much, and things that are hidden from outside, it is a room, and cameras in its middle look
+    middle see about as much, and surfaces that are hidden from outside, it is a room, and cameras in its middle look
     outwards. A surface that is visible from both sides is an open sheet (a floor, a facade); it is seen from the side
     that shows more. Raises DataError if no splat is opaque enough to be a surface, or all are in one point.
     """
@@ -141,22 +141,22 @@ def choose_viewpoints(splats: Splats, settings: RasterSettings, backend: Backend
     cameras = [_camera(center + distance * d, center, size) for d in directions]
     eyes = center + INSIDE * radius * _AXES
     look = partial(_visible, splats, points, SURFACE * radius, settings, backend)
-    seen = np.stack([look(camera) for camera in cameras])
+    visible = np.stack([look(camera) for camera in cameras])
     inside = np.stack([look(_camera(eye, eye + d, size, focal=WIDE)) for eye in eyes for d in _AXES[1:]])
-    outer, inner = seen.any(axis=0), inside.any(axis=0)
+    outer, inner = visible.any(axis=0), inside.any(axis=0)
     least = area[outer].sum()
     if area[inner].sum() > AS_MUCH * least and area[inner & ~outer].sum() > HIDDEN * least:
         around = [_camera(eye, eye + d, size, focal=WIDE) for eye in eyes for d in _sphere(TURNS)]
         return Viewpoints(tuple(around), None, "in the middle of the splats, which surround it")
     opposite = (directions @ directions.T < OPPOSITE).astype(np.float32)
-    sheet = (seen & (opposite @ seen.astype(np.float32) > 0)).any(axis=0)
+    sheet = (visible & (opposite @ visible.astype(np.float32) > 0)).any(axis=0)
     if area[sheet].sum() <= SHEETS * area.sum():
         return Viewpoints(tuple(cameras), box, "around the subject, from all sides")
     axis = np.linalg.eigh((normals[sheet].T * area[sheet]) @ normals[sheet])[1][:, 2]
     sides = [directions @ up >= LEVEL for up in (axis, -axis)]
-    chosen = max(sides, key=lambda side: float(area[seen[side].any(axis=0)].sum()))
-    kept = tuple(camera for camera, kept in zip(cameras, chosen, strict=True) if kept)
-    return Viewpoints(kept, box, "around the subject, from the side of its ground or wall that shows more")
+    chosen = max(sides, key=lambda side: float(area[visible[side].any(axis=0)].sum()))
+    selected = tuple(camera for camera, is_chosen in zip(cameras, chosen, strict=True) if is_chosen)
+    return Viewpoints(selected, box, "around the subject, from the side of its ground or wall that shows more")
 
 
 def _subject(means: ndarray) -> tuple[ndarray, float]:
@@ -196,6 +196,6 @@ def _visible(
     z[~(z > 0)] = np.nan
     column, row = np.floor(small.fx * x / z + small.cx), np.floor(small.fy * y / z + small.cy)
     inside = (column >= 0) & (row >= 0) & (column < TRIED) & (row < TRIED)
-    seen = np.zeros(len(points), bool)
-    seen[inside] = z[inside] <= surface[row[inside].astype(int), column[inside].astype(int)] + depth
-    return seen
+    visible = np.zeros(len(points), bool)
+    visible[inside] = z[inside] <= surface[row[inside].astype(int), column[inside].astype(int)] + depth
+    return visible

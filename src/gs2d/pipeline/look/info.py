@@ -20,7 +20,7 @@ def describe_capture(path: Path) -> dict[str, Any]:
     """Describe a capture, which is a folder."""
     scene = load_scene(path, format=detect_format(path))
     sizes = sorted({(view.camera.width, view.camera.height) for view in scene.views})
-    facts: dict[str, Any] = {
+    details: dict[str, Any] = {
         "capture": str(path),
         "format": scene.format,
         "training views": len(scene.train),
@@ -31,12 +31,12 @@ def describe_capture(path: Path) -> dict[str, Any]:
         "extent": scene.extent,
     }
     if scene.skipped:
-        facts["skipped"] = list(scene.skipped)
+        details["skipped"] = list(scene.skipped)
     if notes := scene.notes + scene.details:
-        facts["notes"] = list(notes)
+        details["notes"] = list(notes)
     if missing := missing_lines(path):
-        facts["missing"] = list(missing)
-    return facts
+        details["missing"] = list(missing)
+    return details
 
 
 def describe_file(path: Path) -> dict[str, Any]:
@@ -58,5 +58,5 @@ def describe_file(path: Path) -> dict[str, Any]:
     shape = {} if kind == "2dgs" else {"shape": "flat" if file.surfels is not None else "3D, which gs2d does not draw"}
     gaussians = file.gaussians
     notes = {"notes": list(file.notes)} if file.notes else {}
-    facts = {"splats": len(gaussians), "layout": file.kind, **shape, "SH degree": gaussians.sh_degree, "bytes": size}
-    return {**facts, **notes}
+    details = {"splats": len(gaussians), "layout": file.kind, **shape, "SH degree": gaussians.sh_degree, "bytes": size}
+    return {**details, **notes}

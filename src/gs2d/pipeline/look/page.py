@@ -82,7 +82,7 @@ def photograph_jpeg(view: View, background: Sequence[float], side: int) -> bytes
 
 
 def _embedded_meshes(run: RunFolder) -> dict[str, bytes]:
-    """Return the meshes of a run, small enough for a page. A textured mesh with more faces is left out."""
+    """Return the meshes of a run, small enough for a page. A textured mesh with more faces is omitted."""
     meshes = {}
     if run.file(MESH).exists():
         meshes["mesh"] = web_mesh(simplify(read_mesh(run.file(MESH)), faces=EMBEDDED_FACES))
@@ -146,14 +146,14 @@ def page_scene(
     cameras = [view.camera for view in photographs]
     focus, unit = _focus(cameras, centers)
     if photographs:
-        seen = [PageView(view.name, view.camera) for view in photographs]
-        return PageScene(title, seen, settings, focus, unit, up_direction(cameras), subject, world)
+        views = [PageView(view.name, view.camera) for view in photographs]
+        return PageScene(title, views, settings, focus, unit, up_direction(cameras), subject, world)
     subject = replace(subject or _most_splats(centers), kind=OBJECT)
     side = np.cross(subject.up, [1.0, 0.0, 0.0] if abs(subject.up[0]) < 0.9 else [0.0, 1.0, 0.0])
     arm = side + np.cross(subject.up, side) + 0.7 * subject.up  # diagonally, from above
     eye = subject.center + OPENING_DISTANCE * subject.radius * arm / np.linalg.norm(arm)
-    seen = [PageView("Opening view", look_at(eye, subject.center, subject.up, width=4, height=3, fx=4.0))]
-    return PageScene(title, seen, settings, focus, unit, subject.up, subject, world, is_photographed=False)
+    views = [PageView("Opening view", look_at(eye, subject.center, subject.up, width=4, height=3, fx=4.0))]
+    return PageScene(title, views, settings, focus, unit, subject.up, subject, world, is_photographed=False)
 
 
 def _most_splats(centers: np.ndarray) -> Subject:

@@ -61,11 +61,11 @@ def serve(server: PageServer, on_event: OnEvent = ignore) -> None:
 def photographs_route(views: Sequence[View], background: Sequence[float]) -> Route:
     """Return the route of the photographs of the views, as small JPEG files."""
 
-    def answer(arguments: Mapping[str, str]) -> Answer:
+    def respond(arguments: Mapping[str, str]) -> Answer:
         view = views[number_in(arguments, "view", len(views))]
         return Answer("image/jpeg", [photograph_jpeg(view, background, PHOTOGRAPH_SIDE)])
 
-    return answer
+    return respond
 
 
 def _stages_route(stages: Mapping[str, Callable[[], Splats]], scene: PageScene) -> Route:
@@ -75,14 +75,14 @@ def _stages_route(stages: Mapping[str, Callable[[], Splats]], scene: PageScene) 
     def packed(stage: str) -> PackedSplats:
         return pack_for(scene, stages[stage]())
 
-    def answer(arguments: Mapping[str, str]) -> Answer:
+    def respond(arguments: Mapping[str, str]) -> Answer:
         stage = arguments.get("stage", "")
         if stage not in stages:
             raise DataError(f"stage must be one of {', '.join(stages)}, got {stage[:40]!r}")
         with lock:
             return splats_answer(packed(stage))
 
-    return answer
+    return respond
 
 
 def _splats_of(checkpoint: Path) -> Splats:
@@ -92,9 +92,9 @@ def _splats_of(checkpoint: Path) -> Splats:
 def _mesh_routes(run: RunFolder) -> dict[str, Route]:
     """Return the routes of the meshes that a run has."""
 
-    def answer(name: str, _: Mapping[str, str]) -> Answer:
+    def respond(name: str, _: Mapping[str, str]) -> Answer:
         mesh = read_mesh(run.file(MESH)) if name == "mesh" else read_textured(run.file(TEXTURED))
         return Answer("application/octet-stream", [web_mesh(mesh)])
 
     files = {"mesh": MESH, "textured": TEXTURED}
-    return {name: partial(answer, name) for name, file in files.items() if run.file(file).exists()}
+    return {name: partial(respond, name) for name, file in files.items() if run.file(file).exists()}

@@ -176,13 +176,13 @@ def rasterizer_speed(backend: Backend) -> float:
         ).to(backend.device)
         splats = Splats(**{name: tensor.requires_grad_() for name, tensor in start.items()})
         camera = Camera(side, side, float(side), float(side), side / 2, side / 2, np.eye(4))
-        taken = []
+        times = []
         for _ in range(5):  # the first may compile or allocate; a busy machine interrupts others
             begun = time.perf_counter()
             rasterize(splats, camera, RasterSettings(), backend=backend).color.sum().backward()
             splats.means.grad.sum().item()  # type: ignore[union-attr]  # waits for a GPU
-            taken.append(time.perf_counter() - begun)
-        seconds = min(taken)
+            times.append(time.perf_counter() - begun)
+        seconds = min(times)
         if seconds > ENOUGH_SECONDS:
             break
     return seconds / side**2

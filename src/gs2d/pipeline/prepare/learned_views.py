@@ -39,10 +39,10 @@ GRID = 5  # points along each side of an image, by which motion is measured
 # -- appearance --------------------------------------------------------------------------------------------------------
 def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
     """Write ``learned.json``, the learned appearance of photographs, and report it."""
-    known = {view.name: view.appearance for view in scene.views if view.appearance}
-    if not known:
+    appearances = {view.name: view.appearance for view in scene.views if view.appearance}
+    if not appearances:
         return
-    views = {view: {name: numbers.tolist() for name, numbers in found.items()} for view, found in known.items()}
+    views = {view: {name: numbers.tolist() for name, numbers in values.items()} for view, values in appearances.items()}
     write_json(run.file(LEARNED), {"format": 2, "about": APPEARANCE, "views": views})
     exposures = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
     if exposures:
@@ -63,14 +63,14 @@ def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Sce
     remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
     try:
         views = read_json(run.file(LEARNED))["views"]
-        found = {view: {name: _numbers(name, values) for name, values in views[view].items()} for view in views}
+        appearances = {view: {name: _numbers(name, values) for name, values in views[view].items()} for view in views}
     except (DataError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise RunError(f"{run.file(LEARNED)} does not hold the appearance of this run ({error}); {remedy}") from error
     for view in scene.train:
-        missing = names - found.get(view.name, {}).keys()
+        missing = names - appearances.get(view.name, {}).keys()
         if missing:
             raise RunError(f"{run.file(LEARNED)} lacks the {min(missing)} of {view.name}; {remedy}")
-    return scene.with_appearance(found)
+    return scene.with_appearance(appearances)
 
 
 def _numbers(name: str, values: list[float]) -> np.ndarray:
@@ -84,14 +84,14 @@ def _numbers(name: str, values: list[float]) -> np.ndarray:
 
 
 def photographed(view: View, color: Tensor, background: tuple[float, float, float]) -> Tensor:
-    """Return a rendering [H, W, 3] of a view with the appearance of its photograph, if known."""
+    """Return a rendering [H, W, 3] of a view with the appearance of its photograph, if learned."""
     if not view.appearance:
         return color
     return shown(color, numbers_of(view, color), ImagePoints(view.camera, *over(view, color, background)))
 
 
 def as_scene(view: View) -> np.ndarray:
-    """Return the photograph of a view, uint8 [H, W, 3 or 4], with its appearance removed, if known."""
+    """Return the photograph of a view, uint8 [H, W, 3 or 4], with its learned appearance removed."""
     image = view.image()
     if not view.appearance:
         return image

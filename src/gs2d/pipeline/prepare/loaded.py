@@ -1,4 +1,4 @@
-"""A run as a value, which ``run.json`` holds, and with its capture in memory: from options, or from its folder."""
+"""A run as a value, stored in ``run.json``, and with its capture in memory: from options, or from its folder."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class ResolvedRun:
         """Return the run as plain JSON values."""
         return {**encode(self), "raster": self.raster.facts(), "seed": self.recipe.seed}
 
-    def decisive_facts(self) -> dict[str, Any]:
+    def decisive_fields(self) -> dict[str, Any]:
         """Return what determines the bytes of the splats, as JSON values.
 
         The background is part of ``raster``. Fused depth and subject affect the mesh only.
@@ -122,12 +122,12 @@ class ResolvedRun:
 
 
 def read_resolved(run: RunFolder) -> ResolvedRun:
-    """Return the run that ``run.json`` holds. Raises RunError if another version wrote it, or it was edited."""
+    """Return the run in ``run.json``. Raises RunError if another version wrote it, or it was edited."""
     data = run.definition()
-    known = {entry.name: data[entry.name] for entry in fields(ResolvedRun) if entry.name in data}
+    present = {entry.name: data[entry.name] for entry in fields(ResolvedRun) if entry.name in data}
     try:
         with absent_guests():
-            resolved: ResolvedRun = decode(known, ResolvedRun, "run")
+            resolved: ResolvedRun = decode(present, ResolvedRun, "run")
         validate(resolved.recipe)
         check_settings(resolved.raster)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecipeError, DataError, ShapeError) as e:
@@ -141,7 +141,7 @@ def read_resolved(run: RunFolder) -> ResolvedRun:
 
 def check_same_run(run: RunFolder, resolved: ResolvedRun) -> None:
     """Raise RunError with the first difference, if the run in a folder cannot be resumed as ``resolved``."""
-    old, new = read_resolved(run).decisive_facts(), resolved.decisive_facts()
+    old, new = read_resolved(run).decisive_fields(), resolved.decisive_fields()
     name = next((name for name in new if old[name] != new[name]), None)
     if name is None:
         return
@@ -206,18 +206,18 @@ class LoadedRun:
 
         ``processes`` is as in ``TrainState``; by default this run's number, from the start.
         """
-        facts = self.resolved.decisive_facts()
-        recipe = {name: value for name, value in facts["recipe"].items() if name not in ("name", "fused_depth")}
+        inputs = self.resolved.decisive_fields()
+        recipe = {name: value for name, value in inputs["recipe"].items() if name not in ("name", "fused_depth")}
         if processes is None:
             processes = [(0, 0, self.processes)] if self.processes > 1 else []
-        facts |= {
+        inputs |= {
             "recipe": {**recipe, "stages": recipe["stages"][: index + 1]},
             "scene": self.resolved.scene.digest,
             "downscale": None,  # part of the digest of the images
             "versions": {name: versions()[name] for name in ("2dgs-r", "torch")},
             "processes": list(map(list, processes)),
         }
-        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +251,8 @@ class Trained:
 
 
 # -- before training ---------------------------------------------------------------------------------------------------
-def loaded_run(options: TrainOptions, recipe: Recipe, capture: OpenCapture, digest: str, **facts: Any) -> LoadedRun:
-    """Return the run of a recipe on a capture with this digest; ``facts`` are further fields of ``ResolvedRun``."""
+def loaded_run(options: TrainOptions, recipe: Recipe, capture: OpenCapture, digest: str, **extra: Any) -> LoadedRun:
+    """Return the run of a recipe on a capture with this digest; ``extra`` are further fields of ``ResolvedRun``."""
     resolved = ResolvedRun(
         recipe=recipe,
         protocol=capture.protocol,
@@ -261,7 +261,7 @@ def loaded_run(options: TrainOptions, recipe: Recipe, capture: OpenCapture, dige
         raster=raster_settings(capture.protocol, capture.scene.extent, recipe.sh_degree, recipe.mip_px),
         backend=capture.backend.facts(),
         execution=Execution(**values(Execution, options)),
-        **facts,
+        **extra,
     )
     return LoadedRun(resolved, capture.scene, capture.backend)
 
@@ -440,6 +440,6 @@ def _of_priors(view: View, plan: DepthPlan | None, normal: NormalTarget | None) 
     if plan is not None and plan.source != "sparse" and view.maps is not None and view.maps.files.depth is not None:
         arrays.append(view.maps.depth().values)
     if plan is not None and plan.observed is not None:
-        seen = plan.observed.seen.get(view.name, np.zeros(0, dtype=np.int64))
-        arrays += [values[seen] for values in (plan.observed.points, plan.observed.error, plan.observed.track)]
+        rows = plan.observed.seen.get(view.name, np.zeros(0, dtype=np.int64))
+        arrays += [values[rows] for values in (plan.observed.points, plan.observed.error, plan.observed.track)]
     return arrays

@@ -207,21 +207,21 @@ def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -
     observed = scene.observed()
     if observed is None or len(observed.points) != len(points):
         return scene
-    masked, kept = np.zeros((2, len(points)), dtype=np.int64)
+    masked, valid = np.zeros((2, len(points)), dtype=np.int64)
     for view in scene.train:
         rows = observed.seen.get(view.name)
         if rows is None or not len(rows):
             continue
-        shown = _kept_pixels(view)
+        shown = _unmasked_pixels(view)
         pixels, depth = view.camera.project(observed.points[rows])
         with np.errstate(invalid="ignore"):
             column = np.floor(pixels[:, 0]).clip(0, shown.shape[1] - 1)
             row = np.floor(pixels[:, 1]).clip(0, len(shown) - 1)
         inside = (depth > 0) & np.isfinite(pixels).all(axis=1)
         keeps = shown[row[inside].astype(np.int64), column[inside].astype(np.int64)]
-        np.add.at(kept, rows[inside][keeps], 1)
+        np.add.at(valid, rows[inside][keeps], 1)
         np.add.at(masked, rows[inside][~keeps], 1)
-    out = (masked > 0) & (kept == 0)
+    out = (masked > 0) & (valid == 0)
     if not out.any() or out.all():
         return scene
     line = f"{int(out.sum()):,} of {len(points):,} sparse points are in masked pixels only: left out"
@@ -230,10 +230,10 @@ def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -
     return replace(scene, points=PointCloud(points.points[~out], *arrays))
 
 
-def _kept_pixels(view: View) -> np.ndarray:
+def _unmasked_pixels(view: View) -> np.ndarray:
     """Return the pixels that a mask keeps, [H, W] bool; the border that undistortion leaves counts as kept."""
-    kept = np.ones((view.camera.height, view.camera.width), dtype=bool)
+    usable = np.ones((view.camera.height, view.camera.width), dtype=bool)
     mask, valid, alpha = view.mask(), view.valid(), view.alpha()
     if mask is not None:
-        kept &= mask if valid is None else mask | ~valid
-    return kept if alpha is None else kept & (alpha >= 0.5)
+        usable &= mask if valid is None else mask | ~valid
+    return usable if alpha is None else usable & (alpha >= 0.5)

@@ -83,11 +83,11 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     sweep_workspace(out)
     check_out(options.out, options.photos, overwrite=options.overwrite)
     threads = options.threads or available_cores()
-    made = make_folder(out.parent)
+    created = make_folder(out.parent)
     try:
-        with workspace(out) as work, _kept(work, on_event):
+        with workspace(out) as work, _resumable(work, on_event):
             check_out(options.out, options.photos, overwrite=options.overwrite)  # the workspace may have restored one
-            source = _source_facts(options, paths)
+            source = _source_fields(options, paths)
             root = work / FRAMES if video else options.photos
             paths = _frames_of(video, work, options.frames, source, on_event) if video else paths
             reading = read_photos(paths, root, threads=threads)
@@ -118,7 +118,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             put_in_place(work / STAGED, out, work)
             forget(work)
     except BaseException:
-        remove_made(made)
+        remove_made(created)
         raise
     for line in _warnings(result):
         on_event(Notice(line))
@@ -126,7 +126,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
 
 
 @contextlib.contextmanager
-def _kept(work: Path, on_event: OnEvent) -> Iterator[None]:
+def _resumable(work: Path, on_event: OnEvent) -> Iterator[None]:
     """Report that intermediate results are kept, if the search fails."""
     try:
         yield
@@ -154,7 +154,7 @@ def requested_options(options: PosesOptions) -> dict[str, Any]:
     return {name: str(value.resolve()) if isinstance(value, Path) else value for name, value in requested.items()}
 
 
-def _source_facts(options: PosesOptions, paths: Sequence[Path]) -> dict[str, Any]:
+def _source_fields(options: PosesOptions, paths: Sequence[Path]) -> dict[str, Any]:
     """Return what determines the copies of the photographs: files, programs and options."""
     return {
         "versions": {**versions(), "pycolmap": importlib.metadata.version("pycolmap")},
@@ -246,7 +246,7 @@ def _request(
     # Fisheyes are set later: COLMAP verifies no pair of fisheyes with unknown focal length.
     lens = START if options.camera_model in ("auto", FISHEYE) else options.camera_model
     order, ordered_by = in_order_taken(photos)
-    known = sum(position is not None for position in positions)
+    located = sum(position is not None for position in positions)
     return {  # every path is absolute
         "images": str(work / STAGED / IMAGES),
         "database": str(work / DATABASE),
@@ -263,7 +263,7 @@ def _request(
         "in_order": [photos[i].name for i in order],  # in which they were taken
         "ordered_by": ordered_by,  # "time" or "name"
         "places": [positions[i] for i in order],  # metres; None: unknown
-        "matching": _matching(options.matching, len(photos), known),
+        "matching": _matching(options.matching, len(photos), located),
         "mapper": options.mapper if options.mapper != "auto" else "global" if len(photos) >= MANY else "incremental",
         **{name: getattr(options, name) for name in ("overlap", "neighbours", "feature_size", "seed")},
         "threads": threads,
@@ -280,19 +280,19 @@ def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list
     """
     labels = [photo.label for photo in photos]
     if listed is None:
-        known = {photo.label: np.array(photo.taken.place) for photo in photos if photo.taken.place is not None}
-        positions = Positions(known, None, "GPS in EXIF", in_degrees=True)
+        located = {photo.label: np.array(photo.taken.place) for photo in photos if photo.taken.place is not None}
+        positions = Positions(located, None, "GPS in EXIF", in_degrees=True)
     else:
         positions = read_positions(listed)
-        known = matched(positions, labels)
-        if not known:
+        located = matched(positions, labels)
+        if not located:
             raise DataError(
                 f"{listed} names none of the {len(photos)} photographs, such as {labels[0]} (its first is "
                 f"{next(iter(positions.places), 'missing')})"
             )
-    if len(known) < 2:
+    if len(located) < 2:
         return [None] * len(photos), ""
-    metres = np.stack(list(known.values()))
+    metres = np.stack(list(located.values()))
     if positions.in_degrees:
         metres = to_enu(metres, np.append(np.median(metres[:, :2], axis=0), 0.0))
     if not np.isfinite(metres[:, 2]).all():
@@ -301,7 +301,7 @@ def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list
     if listed is None and spread < _MIN_SPREAD:
         note = f"GPS positions are not used: they spread over {spread:.1f} m (root mean square), the error of receivers"
         return [None] * len(photos), note
-    by_label = dict(zip(known, ((float(x), float(y), float(z)) for x, y, z in metres), strict=True))
+    by_label = dict(zip(located, ((float(x), float(y), float(z)) for x, y, z in metres), strict=True))
     note, lost = "", [label for label in labels if label not in by_label]
     if lost:
         names = ", ".join(lost[:_SHOWN]) + (" ..." if len(lost) > _SHOWN else "")
@@ -309,9 +309,9 @@ def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list
     return [by_label.get(label) for label in labels], note
 
 
-def _matching(requested: str, count: int, known: int) -> str:
+def _matching(requested: str, count: int, located: int) -> str:
     """Return how pairs are chosen for ``count`` photographs, of which ``known`` have positions."""
-    if requested == "spatial" and not known:
+    if requested == "spatial" and not located:
         raise DataError(
             f"--matching spatial needs photographs with positions, got none of {count}; use --positions FILE or "
             "--matching similar"
@@ -320,7 +320,7 @@ def _matching(requested: str, count: int, known: int) -> str:
         return requested
     if count <= ALL_PAIRS:
         return "exhaustive"
-    return "spatial" if known >= POSITIONED * count else "similar"
+    return "spatial" if located >= POSITIONED * count else "similar"
 
 
 def _progress(on_event: OnEvent) -> Callable[[str, int, int], None]:
@@ -344,15 +344,15 @@ def _read_models(
     Raises DataError if no photograph was placed.
     """
     models = [read_model(Path(request["output"]) / str(i), done) for i, done in enumerate(solved["models"])]
-    facts = read_facts(Path(request["database"]))
-    check_any(models, facts, options.photos)
+    stats = read_facts(Path(request["database"]))
+    check_any(models, stats, options.photos)
     best = models[0]
     per_camera = Counter(image.camera_id for image in best.images)
     rows = []
     for photo, how in zip(photos, staged, strict=True):
-        row = {"name": photo.name, "source": photo.label, "file": how, "features": facts.features.get(photo.name, 0)}
+        row = {"name": photo.name, "source": photo.label, "file": how, "features": stats.features.get(photo.name, 0)}
         placed = photo.name in best.names
-        reason = {} if placed else {"reason": why_not_placed(photo.name, models, facts)}
+        reason = {} if placed else {"reason": why_not_placed(photo.name, models, stats)}
         rows.append({**row, "placed": placed, **reason})
     return models, {
         "photos": str(options.photos.resolve()),
@@ -384,7 +384,7 @@ def _read_models(
         "options": {
             "matching": request["matching"],
             "mapper": request["mapper"],
-            "pairs_matched": len(facts.matches),
+            "pairs_matched": len(stats.matches),
             "threads": request["threads"],
         },
         "created": now(),

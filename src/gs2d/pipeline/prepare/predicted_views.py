@@ -37,6 +37,6 @@ def with_predicted(scene: Scene, brightness: Callable[[View], float] | None = No
     See :meth:`gs2d.training.learned.quantity.LearnedQuantity.predicted`.
     """
     for name in sorted({name for view in scene.train for name in view.appearance if name in QUANTITIES}):
-        found = QUANTITIES.get(name).predicted(scene, brightness)
-        scene = scene.with_appearance({view: {name: numbers} for view, numbers in found.items()})
+        predicted = QUANTITIES.get(name).predicted(scene, brightness)
+        scene = scene.with_appearance({view: {name: numbers} for view, numbers in predicted.items()})
     return scene

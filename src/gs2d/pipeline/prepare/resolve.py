@@ -77,11 +77,11 @@ def build_recipe(
     value = scale_schedule(value, schedule_scale) if iterations is None else fit_schedule(value, iterations)
     value = longer_steps(value, schedule_scale if iterations is None else iterations / full) if robust else value
     value = apply_overrides(replace(value, seed=seed), training.overrides)
-    for option, wanted, field in (
+    for option, requested, field in (
         ("--depth-prior", training.depth_prior is not None, "depth_prior"),
         ("--normal-prior", training.normal_prior, "normal_prior"),
     ):
-        if wanted and getattr(value, field) is None:
+        if requested and getattr(value, field) is None:
             raise RecipeError(f"{option} and --set {field}=null contradict each other, got both; leave one out")
     losses_of(validate(value))  # checks the options of the losses
     return value
@@ -155,17 +155,17 @@ def robust_and_exposure(training: Training, scene: Scene, protocol: Protocol, on
     observe them. "auto" in ``training.learn`` learns exposures if the colours of those points vary.
     """
     robust = training.robust == "on" or (training.robust == "auto" and protocol.robust)
-    lacks = scene.unobserved() if robust else ""
-    if lacks and scene.observed() is not None:
-        on_event(Notice(f"sparse points are projected into the images: {lacks}", detail=True))
-    elif lacks and training.robust == "auto":
+    missing = scene.unobserved() if robust else ""
+    if missing and scene.observed() is not None:
+        on_event(Notice(f"sparse points are projected into the images: {missing}", detail=True))
+    elif missing and training.robust == "auto":
         robust = False
-        on_event(Notice(f"training is not robust: {lacks}"))
+        on_event(Notice(f"training is not robust: {missing}"))
     learned = training.learned
     exposure = "exposure" in learned
-    if robust and not exposure and "auto" in learned and (found := point_gains(scene)) is not None:
-        exposure = spread(found) >= DIFFERS
-        least, most = found.mean(axis=1).min(), found.mean(axis=1).max()
+    if robust and not exposure and "auto" in learned and (gains := point_gains(scene)) is not None:
+        exposure = spread(gains) >= DIFFERS
+        least, most = gains.mean(axis=1).min(), gains.mean(axis=1).max()
         decision = "learned for each photograph" if exposure else "treated as equal (--learn exposure learns them)"
         on_event(
             Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times the mean; {decision}", detail=True)
@@ -178,14 +178,14 @@ def with_backdrop(recipe: Recipe, protocol: Protocol, scene: Scene, on_event: On
 
     On a uniform, unlit backdrop, splats of its colour are proposed for removal.
     """
-    found = find_backdrop(scene) if recipe.removal is not None and protocol.background == BLACK else None
-    if found is None or recipe.removal is None:
+    backdrop = find_backdrop(scene) if recipe.removal is not None and protocol.background == BLACK else None
+    if backdrop is None or recipe.removal is None:
         return recipe, protocol
-    if found.is_unlit:
+    if backdrop.is_unlit:
         recipe = replace(recipe, removal=replace(recipe.removal, backdrop=True))
-    color = ", ".join(f"{value:.2f}" for value in found.color)
+    color = ", ".join(f"{value:.2f}" for value in backdrop.color)
     on_event(Notice(f"background: ({color}), the colour of regions without sparse points", detail=True))
-    return recipe, replace(protocol, background=found.color)
+    return recipe, replace(protocol, background=backdrop.color)
 
 
 def with_fused_depth(protocol: Protocol, recipe: Recipe) -> Protocol:

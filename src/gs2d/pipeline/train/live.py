@@ -39,7 +39,7 @@ class Live:
         self._copy: Splats | None = None
         self._packed: PackedSplats | None = None
         self._version = 0
-        self._asked = -math.inf  # time of the last poll
+        self._polled = -math.inf  # time of the last poll
         self._copy_at, self._copied = 0.0, 0.0
         self._phase, self._total, self._status, self._psnr = "", 0, "training begins", ""
         self._reported = False
@@ -49,8 +49,8 @@ class Live:
         page = served_page(self._scene, PageOffer(photographs=True, live=True))
         routes = {
             "": lambda _: Answer("text/html; charset=utf-8", [page]),
-            "state": self._answer_state,
-            "splats": self._answer_splats,
+            "state": self._state_response,
+            "splats": self._splats_response,
             "photograph": photographs_route(views, loaded.settings.background),
         }
         self._server = PageServer(loaded.resolved.execution.viewer or None, routes, option="--viewer")
@@ -75,7 +75,7 @@ class Live:
         now = time.monotonic()
         if not isinstance(event, Progress | StageStarted) or now < self._copy_at:
             return
-        if now - self._asked > WATCHED or self._server.failure is not None:
+        if now - self._polled > WATCHED or self._server.failure is not None:
             return
         try:
             copy = Splats(**{name: tensor.detach().to("cpu", copy=True) for name, tensor in state.splats.items()})
@@ -92,19 +92,19 @@ class Live:
         self._server.close()
 
     # -- the server's threads ------------------------------------------------------------------------------------------
-    def _answer_state(self, _: Mapping[str, str]) -> Answer:
-        self._asked = time.monotonic()
+    def _state_response(self, _: Mapping[str, str]) -> Answer:
+        self._polled = time.monotonic()
         state = {"version": self._version, "status": self._status}
         return Answer("application/json", [json.dumps(state).encode()])
 
-    def _answer_splats(self, _: Mapping[str, str]) -> Answer:
+    def _splats_response(self, _: Mapping[str, str]) -> Answer:
         with self._lock:
             if self._copy is not None:
                 began = time.thread_time()  # not the time that it waits for a core
                 self._packed = pack_for(self._scene, self._copy)
                 self._copy = None
-                taken = self._copied + time.thread_time() - began
-                self._copy_at = time.monotonic() + max(MIN_SECONDS, taken / MAX_FRACTION)
+                seconds = self._copied + time.thread_time() - began
+                self._copy_at = time.monotonic() + max(MIN_SECONDS, seconds / MAX_FRACTION)
             if self._packed is None:
                 raise DataError("there are no splats yet")
             return splats_answer(self._packed)

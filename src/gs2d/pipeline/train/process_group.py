@@ -81,7 +81,7 @@ def lead(loaded: LoadedRun, together: ProcessGroup, on_event: OnEvent) -> Loaded
     rates = loaded.recipe.stages[0].lr
     rate = rates.for_views(together.size).sh0 / rates.sh0
     on_event(Notice(f"{together.size} processes: {together.size} views per iteration, learning rates times {rate:.3g}"))
-    together.broadcast({"scene": str(loaded.resolved.scene.path), "facts": _shared_facts(loaded)})
+    together.broadcast({"scene": str(loaded.resolved.scene.path), "fields": _shared_fields(loaded)})
     return replace(loaded, processes=together.size)
 
 
@@ -90,10 +90,10 @@ def follow(options: TrainOptions, together: ProcessGroup) -> RunFolder:
 
     Raises RunError if this process would train something else, LostContactError if process 0 has ended.
     """
-    sent: dict[str, Any] = together.broadcast({})
-    loaded = prepare_run(replace(options, scene=Path(sent["scene"])), ignore)
-    for name, value in _shared_facts(loaded).items():
-        if sent["facts"][name] != value:
+    received: dict[str, Any] = together.broadcast({})
+    loaded = prepare_run(replace(options, scene=Path(received["scene"])), ignore)
+    for name, value in _shared_fields(loaded).items():
+        if received["fields"][name] != value:
             raise RunError(
                 f"all processes must train the same, got another {'versions' if name == 'key' else name} than process "
                 "0; use the same command, capture and versions, on CPUs of one kind"
@@ -116,6 +116,6 @@ def follow(options: TrainOptions, together: ProcessGroup) -> RunFolder:
     return RunFolder(options.out)
 
 
-def _shared_facts(loaded: LoadedRun) -> dict[str, Any]:
+def _shared_fields(loaded: LoadedRun) -> dict[str, Any]:
     """Return what must be equal in all processes."""
-    return {**loaded.resolved.decisive_facts(), "key": loaded.stage_key(len(loaded.recipe.stages) - 1)}
+    return {**loaded.resolved.decisive_fields(), "key": loaded.stage_key(len(loaded.recipe.stages) - 1)}

@@ -44,10 +44,10 @@ def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> tuple[Train
             continue
         run.events.cut(payload["events_bytes"])
         finished = checkpoint.stage_index + (checkpoint.iteration is None)
-        metrics, kept = run.metrics(), {"surface": None}
+        metrics, retained = run.metrics(), {"surface": None}
         if finished == len(loaded.recipe.stages):  # facts of the mesh are still valid
-            kept |= {name: metrics[name] for name in ("surface", "mesh") if name in metrics}
-        run.write_metrics({"stages": metrics["stages"][:finished], **kept})
+            retained |= {name: metrics[name] for name in ("surface", "mesh") if name in metrics}
+        run.write_metrics({"stages": metrics["stages"][:finished], **retained})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
         return state, payload["seconds"]
     raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")

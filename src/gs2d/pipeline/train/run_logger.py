@@ -142,13 +142,13 @@ class RunLogger:
         state = self._state
         if state.step == 0 and not state.entered:
             if state.stage > 0:
-                self._take_over(state.stage - 1, self._facts())
+                self._take_over(state.stage - 1, self._costs())
             self._reset_stage()
         self._saved_iteration = state.step
         if state.processes and state.processes[-1][:2] == (state.stage, state.step):
             stage, count = min(state.stage, len(self._loaded.recipe.stages) - 1), self._trainer.processes.size
-            fact = {"stage": self._stage(stage).name, "iteration": state.step, "count": count}
-            self._run.events.append({"kind": "processes", **fact})
+            fields = {"stage": self._stage(stage).name, "iteration": state.step, "count": count}
+            self._run.events.append({"kind": "processes", **fields})
         self._phase()
         self._clock.start()
         if state.entered:
@@ -203,8 +203,8 @@ class RunLogger:
 
     # -- the log -------------------------------------------------------------------------------------------------------
     def _log(self, event: events.TrainingEvent, **extra: Any) -> None:
-        facts = {k: v for k, v in asdict(event).items() if not isinstance(v, float) or math.isfinite(v)}
-        self._run.events.append({"kind": event.kind, **facts, **extra})
+        fields = {k: v for k, v in asdict(event).items() if not isinstance(v, float) or math.isfinite(v)}
+        self._run.events.append({"kind": event.kind, **fields, **extra})
 
     def _on_progress(self, event: events.Progress) -> None:
         last, total = event.iteration == event.iterations, self._iterations_before(event.index) + event.iteration
@@ -243,7 +243,7 @@ class RunLogger:
     def _reset_stage(self) -> None:
         self._clock, self._saved_iteration = StageClock(), 0
 
-    def _facts(self) -> dict[str, Any]:
+    def _costs(self) -> dict[str, Any]:
         """Return the entry of a stage in ``metrics.json`` without its scores."""
         return {"seconds": round(self._clock.seconds, 3), "peak_memory_bytes": peak_memory()}
 
@@ -254,7 +254,7 @@ class RunLogger:
         self._signals.release()
         release_buffers()  # scoring has its own
         with self._attempted_at_end(index):
-            self._score_stage(index, self._facts())
+            self._score_stage(index, self._costs())
         if not self._is_last(index):
             self._phase()
 
@@ -267,7 +267,7 @@ class RunLogger:
         probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
         return mean_psnr(self._loaded.trained(self._trainer.drawn, scene), probes)
 
-    def _take_over(self, index: int, facts: Mapping[str, Any]) -> None:
+    def _take_over(self, index: int, costs: Mapping[str, Any]) -> None:
         """Draw a stage of another run or process, and score it if its scores or measures are missing."""
         stages = self._run.metrics()["stages"]
         if self._is_last(index):
@@ -275,9 +275,9 @@ class RunLogger:
         unseen = self._collected is not None and not self._run.file(VERDICT).exists()
         with self._attempted_at_end(index):
             if len(stages) <= index:
-                self._score_stage(index, facts)
+                self._score_stage(index, costs)
             elif self._is_last(index) and unseen:
-                self._score_stage(index, {**facts, **stages[-1]})
+                self._score_stage(index, {**costs, **stages[-1]})
             else:
                 self._draw(self._stage(index).name)
 
@@ -296,7 +296,7 @@ class RunLogger:
         command = again("evaluate", self._run.path)
         return attempted(f"scores of stage {self._stage(index).name}", command, self._on_event)
 
-    def _score_stage(self, index: int, facts: Mapping[str, Any]) -> None:
+    def _score_stage(self, index: int, costs: Mapping[str, Any]) -> None:
         """Score and draw a finished stage, write its entry of ``metrics.json``, put it into the cache."""
         stage, splats = self._stage(index), self._trainer.splats
         entry: dict[str, Any] = {
@@ -304,7 +304,7 @@ class RunLogger:
             "iterations": stage.iterations,
             "splats": len(splats),
             "bytes": splats.nbytes,
-            **facts,
+            **costs,
         }
         collected = self._collected if self._is_last(index) else None
         for split in ("train", "test"):
@@ -372,9 +372,9 @@ def start_text(event: events.Initialised) -> str:
         "points": "points of the capture",
         "sweep": "points on which neighbouring photographs agree, and points of the capture",
         "depths": "points of the capture and of its known depths",
-        "splats": "given splats",
+        "splats": "initial splats",
         "random": "random points in the box that the cameras look at",
     }
     dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
-    lacks = f"; no dense start: {event.lacks}" if event.lacks else ""
-    return f"starting from {event.splats:,} {sources[event.source]}{dropped}{lacks}"
+    failure = f"; no dense start: {event.lacks}" if event.lacks else ""
+    return f"starting from {event.splats:,} {sources[event.source]}{dropped}{failure}"

@@ -22,7 +22,7 @@ from gs2d.io.run_dir import (
     remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted_file
-from gs2d.pipeline.finish.run_mesh import extract_mesh, keep_facts
+from gs2d.pipeline.finish.run_mesh import extract_mesh, write_mesh_metrics
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
@@ -64,10 +64,10 @@ def train(
         if not together.leads:
             return follow(options, together)
         check_places(options, allowed)
-        heard: list[Event] = []
+        reported: list[Event] = []
 
         def listen(event: Event) -> None:
-            heard.append(event)
+            reported.append(event)
             on_event(event)
 
         loaded = prepare_run(options, listen, title=title) if prepare is None else prepare(options, listen)
@@ -77,7 +77,7 @@ def train(
             discard_on_failure(run),
             nullcontext() if options.viewer is None else closing(Live(loaded, on_event)) as live,
         ):
-            tell = on_event if live is None else live.on_event
+            report = on_event if live is None else live.on_event
             run.made += () if options.cache is None else make_folder(options.cache)
             if is_run(run.path):
                 check_same_run(run, loaded.resolved)
@@ -93,24 +93,24 @@ def train(
                     )
             else:
                 run.write_definition(loaded.resolved.to_json())
-            loaded = lead(loaded, together, tell)
-            start = choose_start(run, loaded, tell)
+            loaded = lead(loaded, together, report)
+            start = choose_start(run, loaded, report)
             if start[0] is None:
-                tell(Notice(_training_line(loaded)))
+                report(Notice(_training_line(loaded)))
                 if prepare is None:
-                    known = None if loaded.init is None else len(loaded.init)
+                    initial = None if loaded.init is None else len(loaded.init)
                     shrunk = loaded.resolved.downscale
-                    needed = estimate(loaded.scene, loaded.recipe, loaded.backend, downscale=shrunk, start=known)
-                    tell(Notice(needed.line()))
-                for event in heard:
+                    needed = estimate(loaded.scene, loaded.recipe, loaded.backend, downscale=shrunk, start=initial)
+                    report(Notice(needed.line()))
+                for event in reported:
                     if isinstance(event, Notice) and event.detail:
                         run.events.append({"kind": Notice.kind, "text": event.text})
             hold()
             collected = Collector(loaded.scene) if prepare is None else None
-            trained = train_stages(run, loaded, start, tell, collected, together, live)
+            trained = train_stages(run, loaded, start, report, collected, together, live)
             release(loaded.scene)  # before the volume of the mesh
             if collected is not None:
-                finish(run, trained, tell, collected, page=options.page)
+                finish(run, trained, report, collected, page=options.page)
         return run
 
 
@@ -200,7 +200,7 @@ def finish(run: RunFolder, trained: Trained, on_event: OnEvent, collected: Colle
     with attempted_file(run, MESH, on_event):
         subject = meshed_subject(run, trained, mesh, on_event)
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
-            keep_facts(run, extract_mesh(trained, mesh, run.file(MESH), on_event, subject=subject))
+            write_mesh_metrics(run, extract_mesh(trained, mesh, run.file(MESH), on_event, subject=subject))
     if page and not run.file(PAGE).exists():
         with attempted_file(run, PAGE, on_event):
             page_run(run.path, on_event=on_event, trained=trained)
