@@ -64,7 +64,7 @@ INSIDE = {
     },
     "losses": {
         "prior_terms": 3,
-        "known_maps view_terms": 2,
+        "priors view_terms": 2,
         "base prior_formulas": 1,
         "formulas": 0,
     },

@@ -220,13 +220,13 @@ def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
     from emulate import Emulator
 
     emulator, backend = Emulator(), EmulatedBackend()
-    before = launch.launcher_for, BACKENDS._things["cuda"]
+    before = launch.launcher_for, BACKENDS._objects["cuda"]
     launch.launcher_for = lambda device: emulator
-    BACKENDS._things["cuda"] = lambda: backend
+    BACKENDS._objects["cuda"] = lambda: backend
     try:
         yield Bench(backend, emulator, True, end)
     finally:
-        launch.launcher_for, BACKENDS._things["cuda"] = before
+        launch.launcher_for, BACKENDS._objects["cuda"] = before
 
 
 def facts(bench: Bench) -> dict[str, Any]:

@@ -31,7 +31,7 @@ class OnMetal(ReferenceBackend):
 def test_a_third_party_device_trains_meshes_and_scores(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(BACKENDS._things, "guest", OnNamedDevice)
+    monkeypatch.setitem(BACKENDS._objects, "guest", OnNamedDevice)
     out = tmp_path / "run"
     assert run(["train", str(capture), "--out", str(out), "--backend", "guest", "--quiet", *TINY]) == 0
     assert RunFolder(out).definition()["backend"]["name"] == "guest"
@@ -43,7 +43,7 @@ def test_qualities_of_another_device_are_those_of_a_gpu(monkeypatch: pytest.Monk
     def normal() -> object:
         return quality_level("normal", is_data_set=False, on_host=get_backend("guest").on_host)
 
-    monkeypatch.setitem(BACKENDS._things, "guest", OnMetal)
+    monkeypatch.setitem(BACKENDS._objects, "guest", OnMetal)
     assert normal() == QUALITIES["normal"]["gpu"]
-    monkeypatch.setitem(BACKENDS._things, "guest", OnNamedDevice)
+    monkeypatch.setitem(BACKENDS._objects, "guest", OnNamedDevice)
     assert normal() == QUALITIES["normal"]["cpu"]

@@ -45,7 +45,7 @@ def file(tmp_path: Path) -> Iterator[Path]:
     path = tmp_path / "recipes_of_mine.py"
     path.write_text(FILE)
     yield path
-    LOSSES._things.pop("of-a-file", None)
+    LOSSES._objects.pop("of-a-file", None)
 
 
 def test_a_python_file_has_recipes_and_functions_that_make_them(file: Path) -> None:
@@ -94,7 +94,7 @@ def test_a_json_file_is_what_recipes_show_prints(tmp_path: Path) -> None:
 
 def test_a_run_with_missing_plug_ins_can_be_read_but_not_trained(file: Path) -> None:
     written = to_json(get_recipe(f"{file}:mine"))
-    del LOSSES._things["of-a-file"]
+    del LOSSES._objects["of-a-file"]
     with absent_guests():  # as a finished run is read
         assert from_json(written).stages[0].losses[-1].kind == "of-a-file"
     with pytest.raises(RecipeError, match="loss"):
@@ -109,4 +109,4 @@ def test_a_registered_recipe_is_found_by_its_name() -> None:
 
     assert get_recipe("of-a-guest").name == "of-a-guest"
     assert about_recipe("of-a-guest") == "Like 2DGS, under another name."
-    del RECIPES._things["of-a-guest"]
+    del RECIPES._objects["of-a-guest"]

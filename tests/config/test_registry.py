@@ -30,7 +30,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def registry() -> Registry[str]:
     made: Registry[str] = Registry("dish", "gs2d.tests", builtin={"soup": "gs2d.errors"}, error=RecipeError)
-    made._things["soup"] = "hot"
+    made._objects["soup"] = "hot"
     return made
 
 

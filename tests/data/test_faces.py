@@ -182,7 +182,7 @@ def test_a_wide_fisheye_is_split_into_faces_and_a_narrow_one_undistorted(tmp_pat
 
 def test_a_registered_camera_model_is_cut_into_faces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stereographic fisheyes, 170 degrees across, from transforms.json."""
-    monkeypatch.setattr(CAMERA_MODELS, "_things", dict(CAMERA_MODELS._things))
+    monkeypatch.setattr(CAMERA_MODELS, "_objects", dict(CAMERA_MODELS._objects))
 
     @gs2d.register_camera_model("stereographic")
     class Stereographic(CameraModel):

@@ -189,7 +189,7 @@ def install(guard: str, emulator: Emulator) -> Counter[str]:
     Tensor.pin_memory = lambda self: self.clone()  # type: ignore[assignment, method-assign]
     torch.autograd.Function.apply = _noting_tensors(vars(torch.autograd.Function)["apply"])
     launch.launcher_for = launcher_for
-    BACKENDS._things["cuda"] = lambda: CudaBackend()  # skips GPU detection
+    BACKENDS._objects["cuda"] = lambda: CudaBackend()  # skips GPU detection
     torch._C._set_only_lift_cpu_tensors(True)  # the mode also intercepts torch.tensor(..., device="cuda")
     _Everywhere().__enter__()
     return launched

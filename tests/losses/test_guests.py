@@ -32,8 +32,8 @@ from loss_images import make_camera, make_output
 def guests() -> Iterator[None]:
     before = {name: LOSSES.get(name) for name in LOSSES.builtin}  # modules register only once
     yield
-    LOSSES._things.clear()
-    LOSSES._things.update(before)
+    LOSSES._objects.clear()
+    LOSSES._objects.update(before)
 
 
 def blackness(output: RenderOutput, view: LossView, power: float = 1.0) -> Tensor:
@@ -85,7 +85,7 @@ def test_a_loss_class_is_prepared_and_may_skip_views() -> None:
 
 
 @pytest.mark.parametrize("kind", ["depth_prior", "normal_prior"])
-def test_losses_on_known_maps_load_their_data(kind: str) -> None:
+def test_losses_on_prior_maps_load_their_data(kind: str) -> None:
     with pytest.raises(RecipeError, match=f"loss '{kind}' must be prepared for a scene"):
         losses_of([LossTerm(kind, 0.1)])
 

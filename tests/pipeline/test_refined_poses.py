@@ -89,7 +89,7 @@ def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, t
 def test_a_quantity_of_a_package_may_move_cameras(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(QUANTITIES._things, "guest", CameraPose)
+    monkeypatch.setitem(QUANTITIES._objects, "guest", CameraPose)
     early = (*SMALL, "learned.guest.start=5", "learned.guest.rate=0.01")
     made = train(options(capture, tmp_path / "run", learn="guest", overrides=early), ignore)
     _, job = open_finished(made.path, 1, ignore)

@@ -229,7 +229,7 @@ def test_a_reader_of_a_package_can_define_the_split(
         def read(self, path: Path, *, downscale: int) -> Capture:
             return replace(read_blender(path), format="guest")
 
-    monkeypatch.setitem(READERS._things, "guest", Guest)
+    monkeypatch.setitem(READERS._objects, "guest", Guest)
     chosen = options(capture, tmp_path / "run", format="guest")
     job = prepare_run(chosen, ignore)
     assert {view.name.split("/")[0] for view in job.scene.test} == {"test"}

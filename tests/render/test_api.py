@@ -95,7 +95,7 @@ def test_for_tensors_auto_follows_their_device(monkeypatch: pytest.MonkeyPatch) 
     def gpu() -> Backend:
         return altered(get_backend("reference"), name="cuda")
 
-    monkeypatch.setitem(BACKENDS._things, "cuda", gpu)
+    monkeypatch.setitem(BACKENDS._objects, "cuda", gpu)
     assert get_backend("auto").name == "cuda"
     assert get_backend("auto", "cuda").name == "cuda"
     assert get_backend("auto", "cpu").name in ("cpu", "reference")
@@ -106,7 +106,7 @@ def test_tensors_on_a_gpu_never_fall_back_to_a_slower_backend(monkeypatch: pytes
     def broken() -> Backend:
         raise BackendError("no compiler; install it")
 
-    monkeypatch.setitem(BACKENDS._things, "cuda", broken)
+    monkeypatch.setitem(BACKENDS._objects, "cuda", broken)
     with pytest.raises(BackendError, match="no compiler"):
         get_backend("auto", "cuda")
     assert get_backend("auto").name in ("cpu", "reference")

@@ -51,7 +51,7 @@ class Twins(Densifier):
 def twins() -> Iterator[None]:
     register_densifier("twins")(Twins)
     yield
-    del DENSIFIERS._things["twins"]
+    del DENSIFIERS._objects["twins"]
 
 
 def with_twins(**options: object) -> Recipe:

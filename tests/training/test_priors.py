@@ -16,8 +16,8 @@ from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.prior_maps import MapFiles, ObservedPoints, PriorDepth
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.losses.known_maps import metric_depths, plan_depths
 from gs2d.losses.prior_formulas import MetricDepth, PointDepths, RelativeDepths
+from gs2d.losses.priors import metric_depths, plan_depths
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.start.initialize import initial_splats, turned_to

@@ -28,7 +28,7 @@ from gs2d.config.recipe import (
     Removal,
     Stage,
 )
-from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
+from gs2d.config.recipe_files import is_recipe_file, read_recipe_file, recipe_from
 from gs2d.config.registry import Register, Registry, did_you_mean
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
@@ -113,8 +113,8 @@ def without_squares(recipe: Recipe) -> Recipe:
         return replace(term, weight=NC_WITHOUT_SQUARES) if _is(term, "normal_consistency", BEST_NC) else term
 
     def plain(stage: Stage) -> Stage:
-        kept = tuple(term for term in stage.losses if not _is(term, "l2", SQUARES))
-        return replace(stage, losses=tuple(map(lighter, kept))) if kept != stage.losses else stage
+        terms = tuple(term for term in stage.losses if not _is(term, "l2", SQUARES))
+        return replace(stage, losses=tuple(map(lighter, terms))) if terms != stage.losses else stage
 
     return replace(recipe, stages=tuple(map(plain, recipe.stages)))
 
@@ -143,8 +143,8 @@ def with_depth_prior(recipe: Recipe, source: str = "auto", weight: float = DEPTH
     the loss keeps it, with the requested source.
     """
     if recipe.depth_prior is not None:
-        known = recipe.depth_prior if source == "auto" else replace(recipe.depth_prior, source=source)
-        return replace(recipe, depth_prior=known)
+        prior = recipe.depth_prior if source == "auto" else replace(recipe.depth_prior, source=source)
+        return replace(recipe, depth_prior=prior)
     # The gradient of the mean depth reaches every splat of a pixel, that of the median depth only one.
     term = LossTerm("depth_prior", weight, depth="mean")
     return replace(_in_stages(recipe, term), name=f"{recipe.name}-depth", depth_prior=DepthPrior(source))
@@ -348,10 +348,10 @@ def register_recipe(name: str) -> Callable[[Register], Register]:
 
 def about_recipe(name: str) -> str:
     """Return one line about a recipe: the first line of its docstring, or the stages."""
-    found = get_recipe(name) if is_recipe_file(name) else RECIPES.get(name)
-    if isinstance(found, Recipe):
-        return ", ".join(f"{stage.name} ({stage.iterations:,})" for stage in found.stages)
-    return (getattr(found, "__doc__", None) or "").strip().partition("\n")[0] or f"a recipe of {RECIPES.source(name)}"
+    entry = get_recipe(name) if is_recipe_file(name) else RECIPES.get(name)
+    if isinstance(entry, Recipe):
+        return ", ".join(f"{stage.name} ({stage.iterations:,})" for stage in entry.stages)
+    return (getattr(entry, "__doc__", None) or "").strip().partition("\n")[0] or f"a recipe of {RECIPES.source(name)}"
 
 
 def get_recipe(name: str) -> Recipe:
@@ -377,7 +377,7 @@ def get_recipe(name: str) -> Recipe:
     if name not in RECIPES:
         near = did_you_mean(name, list(RECIPES))
         raise RecipeError(f"no recipe {name!r}; `gs2d recipes --all` lists them{near}")
-    return made_recipe(RECIPES.get(name), f"recipe {name!r}")
+    return recipe_from(RECIPES.get(name), f"recipe {name!r}")
 
 
 def list_recipes() -> tuple[str, ...]:

@@ -253,7 +253,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """Source of known depths, and how much they count (``losses/known_maps.py``, ``losses/prior_formulas.py``)."""
+    """Source of known depths, and how much they count (``losses/priors.py``, ``losses/prior_formulas.py``)."""
 
     # "sparse": sparse points of the capture; "sensor": depth maps in units of the capture times a factor; "relative":
     # depth maps with an unknown scale and shift for each view; "auto": sensor maps, relative maps or sparse points,

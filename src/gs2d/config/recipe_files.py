@@ -15,7 +15,7 @@ from gs2d.config.registry import did_you_mean
 from gs2d.config.serialize import from_json
 from gs2d.errors import Gs2dError, RecipeError
 
-__all__ = ["is_recipe_file", "made_recipe", "read_recipe_file", "short_name"]
+__all__ = ["is_recipe_file", "read_recipe_file", "recipe_from", "short_name"]
 
 
 def is_recipe_file(name: str) -> bool:
@@ -37,7 +37,7 @@ def read_recipe_file(name: str) -> Recipe:
     """
     if name.endswith(".json"):
         return _from_json_file(Path(name))
-    file, colon, wanted = name.rpartition(":")
+    file, colon, attribute = name.rpartition(":")
     path = Path(file if colon else name)
     if not path.is_file():
         raise RecipeError(
@@ -53,23 +53,23 @@ def read_recipe_file(name: str) -> Recipe:
         )
     if not colon:
         raise RecipeError(f"{path} needs the name of a recipe: --recipe {path}:NAME, one of {', '.join(own)}")
-    if not hasattr(module, wanted):
-        meant = did_you_mean(wanted, own) or f"; it has {', '.join(own)}"
-        raise RecipeError(f"{path} has no recipe {wanted!r}{meant}")
-    return made_recipe(getattr(module, wanted), name)
+    if not hasattr(module, attribute):
+        meant = did_you_mean(attribute, own) or f"; it has {', '.join(own)}"
+        raise RecipeError(f"{path} has no recipe {attribute!r}{meant}")
+    return recipe_from(getattr(module, attribute), name)
 
 
-def made_recipe(found: Any, where: str) -> Recipe:
+def recipe_from(source: Any, where: str) -> Recipe:
     """Return a recipe, or the result of a function without arguments, validated.
 
     Raises RecipeError if the result is no recipe.
     """
     try:
-        value = found() if callable(found) else found
+        value = source() if callable(source) else source
     except Gs2dError:
         raise
     except Exception as error:  # a plug-in may raise anything
-        raise RecipeError(f"{where} cannot be made: {_line(error)}") from error
+        raise RecipeError(f"{where} cannot be created: {_line(error)}") from error
     if not isinstance(value, Recipe):
         raise RecipeError(f"{where} must be a gs2d.Recipe, or a function that returns one, got {type(value).__name__}")
     return validate(value)

@@ -59,7 +59,7 @@ class Registry(Generic[T]):
     ) -> None:
         self.what, self.group, self._error = what, group, error
         self._core = {} if builtin is None else dict(builtin)
-        self._things: dict[str, T] = {}
+        self._objects: dict[str, T] = {}
 
     @cached_property
     def _homes(self) -> dict[str, str]:
@@ -73,18 +73,18 @@ class Registry(Generic[T]):
         Gs2dError if the name is taken.
         """
 
-        def registered(thing: Register) -> Register:
-            home = module or getattr(thing, "__module__", "")
+        def registered(entry: Register) -> Register:
+            home = module or getattr(entry, "__module__", "")
             if self._homes.get(name, home) != home:
                 raise self._error(f"{self.what} {name!r} belongs to gs2d; use another name")
-            holder = self._things.get(name)
-            if holder is not None and holder is not thing:
+            existing = self._objects.get(name)
+            if existing is not None and existing is not entry:
                 raise self._error(
-                    f"{self.what} {name!r} is already registered by {getattr(holder, '__module__', 'another')}; use "
+                    f"{self.what} {name!r} is already registered by {getattr(existing, '__module__', 'another')}; use "
                     "another name"
                 )
-            self._things[name] = thing  # type: ignore[assignment]
-            return thing
+            self._objects[name] = entry  # type: ignore[assignment]
+            return entry
 
         return registered
 
@@ -93,16 +93,16 @@ class Registry(Generic[T]):
 
         Raises Gs2dError if the name is unknown, or its package cannot be imported.
         """
-        if name in self._homes and name not in self._things:
+        if name in self._homes and name not in self._objects:
             import_module(self._homes[name])
-        if name in self._things:
-            return self._things[name]
+        if name in self._objects:
+            return self._objects[name]
         if name in self._offered:
             return self._load(name)
         raise self._error(self.unknown(name))
 
     def make(self, name: str, *arguments: object, options: Mapping[str, Any], where: str = "") -> Any:
-        """Return an object of a registered class, made with its options; ``where`` begins the error message.
+        """Return an object of a registered class with its options; ``where`` begins the error message.
 
         Raises Gs2dError as :meth:`get`, or if the class does not take the options.
         """
@@ -139,7 +139,7 @@ class Registry(Generic[T]):
 
     def names(self) -> tuple[str, ...]:
         """Return all names: those of gs2d, of this program and of packages."""
-        return tuple(dict.fromkeys((*self._homes, *self._things, *self._offered)))
+        return tuple(dict.fromkeys((*self._homes, *self._objects, *self._offered)))
 
     def guests(self) -> tuple[str, ...]:
         """Return the names that do not belong to gs2d."""
@@ -161,10 +161,10 @@ class Registry(Generic[T]):
             return "gs2d"
         if name in self._offered:
             return _package(self._offered[name])
-        return str(getattr(self._things.get(name), "__module__", "this program"))
+        return str(getattr(self._objects.get(name), "__module__", "this program"))
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and (name in self._homes or name in self._things or name in self._offered)
+        return isinstance(name, str) and (name in self._homes or name in self._objects or name in self._offered)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())
@@ -178,27 +178,27 @@ class Registry(Generic[T]):
         offered: dict[str, EntryPoint] = {}
         guests = [entry for entry in entry_points(group=self.group) if not entry.value.startswith(_CONTRIB)]
         for entry in sorted(guests, key=_package):
-            taken = "gs2d" if entry.name in self._homes else None
+            owner = "gs2d" if entry.name in self._homes else None
             if entry.name in offered and offered[entry.name].value != entry.value:
-                taken = _package(offered[entry.name])
-            if taken is None:
+                owner = _package(offered[entry.name])
+            if owner is None:
                 offered[entry.name] = entry
             else:
-                text = f"{_package(entry)} declares the {self.what} {entry.name!r} of {taken}; it is ignored"
+                text = f"{_package(entry)} declares the {self.what} {entry.name!r} of {owner}; it is ignored"
                 warnings.warn(text, PluginWarning, stacklevel=3)
         return offered
 
     def _load(self, name: str) -> T:
         entry = self._offered[name]
         try:
-            thing: Any = entry.load()
+            loaded: Any = entry.load()
         except Exception as error:  # a plug-in may raise anything
             reason = str(error).partition("\n")[0]
             raise self._error(
                 f"{self.what} {name!r} of {_package(entry)} cannot be imported from {entry.value}: "
                 f"{type(error).__name__}: {reason}; fix or uninstall that package"
             ) from error
-        return self._things.setdefault(name, thing)
+        return self._objects.setdefault(name, loaded)
 
 
 @functools.cache

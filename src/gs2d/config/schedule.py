@@ -52,12 +52,12 @@ def fit_schedule(recipe: Recipe, iterations: int) -> Recipe:
             f"iterations must be a whole number from {least} to {most} for recipe {recipe.name!r}, got {iterations!r}"
         )
     factor = iterations / recipe.iterations
-    found = [max(1, math.floor(length * factor)) if length else 0 for length in lengths]
-    while missing := iterations - sum(found):  # at most one per stage
+    rounded = [max(1, math.floor(length * factor)) if length else 0 for length in lengths]
+    while missing := iterations - sum(rounded):  # at most one per stage
         step = 1 if missing > 0 else -1
-        open_stages = [i for i, length in enumerate(lengths) if length and found[i] + step >= 1]
-        found[max(open_stages, key=lambda i: step * (lengths[i] * factor - found[i]))] += step
-    factors = [now / length if length else factor for now, length in zip(found, lengths, strict=True)]
+        open_stages = [i for i, length in enumerate(lengths) if length and rounded[i] + step >= 1]
+        rounded[max(open_stages, key=lambda i: step * (lengths[i] * factor - rounded[i]))] += step
+    factors = [now / length if length else factor for now, length in zip(rounded, lengths, strict=True)]
     return recipe if factor == 1 else _scale(recipe, factor, factors)
 
 
@@ -119,14 +119,14 @@ def _scale_lr(lr: LearningRates, factor: float) -> LearningRates:
 def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify | Densify:
     if isinstance(densify, Densify):
         return densify.scaled(factor)
-    cull, wanted = densify.scale_cull_start, min(MIN_DENSIFICATIONS, count_densifications(densify))
+    cull, needed = densify.scale_cull_start, min(MIN_DENSIFICATIONS, count_densifications(densify))
     scaled = replace(
         densify,
         start=round(densify.start * factor),
         stop=round(densify.stop * factor),
         scale_cull_start=None if cull is None else round(cull * factor),
     )
-    while scaled.every > 1 and count_densifications(scaled) < wanted:
+    while scaled.every > 1 and count_densifications(scaled) < needed:
         scaled = replace(scaled, every=scaled.every - 1)
     if factor >= 1:
         return scaled

@@ -94,15 +94,15 @@ def _set(data: dict[str, Any], words: list[str], value: Any, override: str) -> N
             else:
                 node = node[word]
         else:
-            known = ", ".join(node) if isinstance(node, dict) else "nothing below it (it is null or a plain value)"
+            available = ", ".join(node) if isinstance(node, dict) else "nothing below it (it is null or a plain value)"
             near = did_you_mean(word, list(node)) if isinstance(node, dict) else ""
-            raise RecipeError(f"override {override!r}: no field {word!r}; there is {known}{near}")
+            raise RecipeError(f"override {override!r}: no field {word!r}; there is {available}{near}")
 
 
 def _entry(entries: list[Any], word: str, override: str) -> Any:
     """Return the loss of a kind, or the action or learned quantity of a name."""
-    known = [entry if isinstance(entry, dict) else {} for entry in entries]
-    tags = [str(entry.get("kind", entry.get("name", "?"))) for entry in known]
+    nodes = [entry if isinstance(entry, dict) else {} for entry in entries]
+    tags = [str(entry.get("kind", entry.get("name", "?"))) for entry in nodes]
     if word not in tags:
         raise RecipeError(
             f"override {override!r}: no entry {word!r}; there is {', '.join(tags) or 'none'}{did_you_mean(word, tags)}"
@@ -163,11 +163,11 @@ def _decode_dataclass(value: Any, kind: type, where: str) -> Any:
     if not isinstance(value, Mapping):
         raise RecipeError(f"{where} must be an object, got {value!r}")
     hints = _hints(kind)
-    known = {entry.name: entry for entry in fields(kind)}
+    declared = {entry.name: entry for entry in fields(kind)}
     for key in value:
-        if key not in known:
-            raise RecipeError(f"{where} has no field {key!r}; it has {', '.join(known)}")
-    for name, entry in known.items():
+        if key not in declared:
+            raise RecipeError(f"{where} has no field {key!r}; it has {', '.join(declared)}")
+    for name, entry in declared.items():
         if name not in value and entry.default is MISSING and entry.default_factory is MISSING:
             raise RecipeError(f"{where} lacks the field {name!r}")
     label = value.get("name", "") if isinstance(value.get("name", ""), str) else ""

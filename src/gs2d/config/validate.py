@@ -27,9 +27,9 @@ def number(where: str, value: object, *, low: float) -> float:
     return float(value)
 
 
-def one_of(where: str, value: str, known: tuple[str, ...]) -> None:
-    """Require one of the known values."""
-    require(value in known, f"{where} must be one of {', '.join(known)}; got {value!r}")
+def one_of(where: str, value: str, choices: tuple[str, ...]) -> None:
+    """Require one of the choices."""
+    require(value in choices, f"{where} must be one of {', '.join(choices)}; got {value!r}")
 
 
 def group(where: str, name: str, groups: list[str]) -> None:

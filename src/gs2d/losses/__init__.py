@@ -1,1 +1,1 @@
-"""The terms of the training loss, their references in torch, and what they are made of."""
+"""The terms of the training loss, their references in torch, and their formulas."""

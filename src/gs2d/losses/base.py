@@ -86,7 +86,7 @@ class LossView:
     shared: dict[object, Any] = field(default_factory=dict)
 
     def once(self, key: object, make: Callable[[], Any]) -> Any:
-        """Return the shared result of this key, made by the first loss that asks."""
+        """Return the shared result of this key, computed by the first loss that needs it."""
         if key not in self.shared:
             self.shared[key] = make()
         return self.shared[key]
@@ -102,7 +102,7 @@ class LossView:
 
 
 class Loss:
-    """Base class of losses. A loss is made once for each kind and options of a recipe.
+    """Base class of losses. There is one loss object for each kind and options of a recipe.
 
     The constructor takes the options of a term as keyword arguments.
 
@@ -123,7 +123,7 @@ class Loss:
     only_color: bool = False
 
     def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
-        """Get ready for a scene before training begins; raise a Gs2dError if the scene lacks what is needed."""
+        """Get ready for a scene before training begins; raise a Gs2dError if its data are missing."""
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
         """Return the unweighted loss [] of a rendered view, in plain torch; None to skip the view."""
@@ -141,7 +141,7 @@ class Loss:
         term : LossTerm
             With its weight and depth resolved.
         opaque : bool
-            Whether the image lacks an alpha channel.
+            Whether the image has no alpha channel.
 
         Returns
         -------
@@ -163,16 +163,16 @@ class _Function(Loss):
 
 
 def _make(term: LossTerm) -> Loss:
-    """Return the loss of a term, made with its options."""
-    made = LOSSES.get(term.kind)
-    if not isinstance(made, type):
-        return _Function(made, **term.options)
-    if not issubclass(made, Loss):
+    """Return the loss of a term with its options."""
+    entry = LOSSES.get(term.kind)
+    if not isinstance(entry, type):
+        return _Function(entry, **term.options)
+    if not issubclass(entry, Loss):
         raise RecipeError(
-            f"loss {term.kind!r} must be a function or a subclass of gs2d.losses.base.Loss, got class {made.__name__}"
+            f"loss {term.kind!r} must be a function or a subclass of gs2d.losses.base.Loss, got class {entry.__name__}"
         )
     try:
-        loss = made(**term.options)
+        loss = entry(**term.options)
     except TypeError as error:
         raise RecipeError(f"loss {term.kind!r} does not take the options {dict(term.options)}: {error}") from error
     except RecipeError as error:
@@ -181,7 +181,7 @@ def _make(term: LossTerm) -> Loss:
 
 
 class Losses:
-    """The losses of some terms, each made once by kind and options; RecipeError if a loss does not take its options."""
+    """The losses of some terms, one per kind and options; RecipeError if a loss does not take its options."""
 
     def __init__(self, terms: Iterable[LossTerm]) -> None:
         self._losses: dict[tuple[str, str], Loss] = {}
@@ -277,9 +277,9 @@ def compute_losses(
     for term, weight in active:
         here = replace(view, depth_kind=term.depth or view.depth_kind, weights=weights, shared=shared)
         loss = losses[term]
-        found = loss(output, here) if operations is None else loss.fused(output, here, operations)
-        if found is not None:
-            value = weight * found
+        unweighted = loss(output, here) if operations is None else loss.fused(output, here, operations)
+        if unweighted is not None:
+            value = weight * unweighted
             values[term.kind] = values[term.kind] + value if term.kind in values else value
     return values
 

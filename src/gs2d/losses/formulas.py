@@ -133,8 +133,8 @@ def normals_from_depth(
     height, width = depth.shape
     if min(height, width) < 3:
         return torch.zeros_like(depth)[..., None].expand(-1, -1, 3)
-    known = torch.ones_like(depth, dtype=torch.bool) if mask is None else mask
-    hit = ~(depth <= 0) & known  # NaN counts as a hit: it must reach the loss
+    valid = torch.ones_like(depth, dtype=torch.bool) if mask is None else mask
+    hit = ~(depth <= 0) & valid  # NaN counts as a hit: it must reach the loss
     z = torch.where(hit, depth, torch.zeros_like(depth))  # 0 is the camera centre
     i = torch.arange(width, dtype=depth.dtype, device=depth.device)
     j = torch.arange(height, dtype=depth.dtype, device=depth.device)
@@ -147,11 +147,11 @@ def normals_from_depth(
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     right = points[1:-1, 2:] - points[1:-1, :-2]
     if edges == "camera":
-        defined = known[2:, 1:-1] & known[:-2, 1:-1] & known[1:-1, 2:] & known[1:-1, :-2]
+        defined = valid[2:, 1:-1] & valid[:-2, 1:-1] & valid[1:-1, 2:] & valid[1:-1, :-2]
         defined = defined & (hit[2:, 1:-1] | hit[:-2, 1:-1]) & (hit[1:-1, 2:] | hit[1:-1, :-2])
     else:
         defined = hit[2:, 1:-1] & hit[:-2, 1:-1] & hit[1:-1, 2:] & hit[1:-1, :-2]
-    defined = (defined & known[1:-1, 1:-1])[..., None]
+    defined = (defined & valid[1:-1, 1:-1])[..., None]
     product = torch.linalg.cross(down, right)
     product = torch.where(defined, product, torch.ones_like(product))  # a zero vector has no finite gradient
     normals = torch.where(defined, F.normalize(product, dim=-1, eps=0.0), torch.zeros_like(product))
@@ -235,8 +235,8 @@ def normal_smoothness(normal: Tensor, alpha: Tensor, flatness: Tensor, mask: Ten
 
 def _shifted(image: Tensor, axis: int) -> Tensor:
     """Return the values that are ``SMOOTH_REACH`` px further along an axis; 0 outside the image."""
-    kept = image.narrow(axis, min(SMOOTH_REACH, image.shape[axis]), max(image.shape[axis] - SMOOTH_REACH, 0))
-    return torch.cat([kept, torch.zeros_like(image).narrow(axis, 0, image.shape[axis] - kept.shape[axis])], dim=axis)
+    moved = image.narrow(axis, min(SMOOTH_REACH, image.shape[axis]), max(image.shape[axis] - SMOOTH_REACH, 0))
+    return torch.cat([moved, torch.zeros_like(image).narrow(axis, 0, image.shape[axis] - moved.shape[axis])], dim=axis)
 
 
 def flat_weights(flat: Tensor, factor: float, dtype: torch.dtype) -> Tensor:

@@ -57,7 +57,7 @@ class NormalTarget:
 Depths = PointDepths | MetricDepth | RelativeDepths
 
 
-def depth_prior(known: Depths, depth: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
+def depth_prior(target: Depths, depth: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean relative error of a rendered depth [H, W] where the depth is known and a surface is rendered.
 
     For a map, the mean runs over all valid pixels, and unknown ones count 0. For points, it runs over the points, as if
@@ -65,11 +65,11 @@ def depth_prior(known: Depths, depth: Tensor, alpha: Tensor, mask: Tensor | None
     """
     hit = (alpha.detach() > OPACITY) & (depth.detach() > 0)
     hit = hit if mask is None else hit & mask
-    if isinstance(known, PointDepths):
-        return _of_points(known, depth, hit)
-    if isinstance(known, RelativeDepths):
-        known = aligned(known, depth.detach(), hit)
-    return masked_mean(_robust(torch.where(hit & known.valid, depth * known.disparity - 1, 0)), mask)
+    if isinstance(target, PointDepths):
+        return _of_points(target, depth, hit)
+    if isinstance(target, RelativeDepths):
+        target = aligned(target, depth.detach(), hit)
+    return masked_mean(_robust(torch.where(hit & target.valid, depth * target.disparity - 1, 0)), mask)
 
 
 def _robust(error: Tensor) -> Tensor:
@@ -81,10 +81,10 @@ def _of_points(points: PointDepths, depth: Tensor, hit: Tensor) -> Tensor:
     if len(points.depth) == 0:
         return depth.sum() * 0
     at_points = depth.reshape(-1)[points.pixels]  # [M, 4]
-    seen = hit.reshape(-1)[points.pixels].all(dim=1)
+    visible = hit.reshape(-1)[points.pixels].all(dim=1)
     # On a plane, disparity is linear in the image; depth is not.
-    z = 1 / (points.weights / torch.where(seen[:, None], at_points, 1)).sum(dim=1)
-    return _robust(torch.where(seen, z / points.depth - 1, 0)).sum() / max(len(points.depth), MIN_POINTS)
+    z = 1 / (points.weights / torch.where(visible[:, None], at_points, 1)).sum(dim=1)
+    return _robust(torch.where(visible, z / points.depth - 1, 0)).sum() / max(len(points.depth), MIN_POINTS)
 
 
 @torch.no_grad()
@@ -110,7 +110,7 @@ def fit_line(x: Tensor, y: Tensor, weights: Tensor, rounds: int = FIT_ROUNDS) ->
     ``x``, ``y``, ``weights`` [M]. ``rounds``: number of solutions. Each weighs errors in units of the mean absolute
     error of the previous one.
     """
-    given, tiny = weights, torch.finfo(y.dtype).tiny
+    initial, tiny = weights, torch.finfo(y.dtype).tiny
     scale = shift = y.new_zeros(())
     for _ in range(rounds):
         total = weights.sum().clamp(min=tiny)
@@ -119,17 +119,17 @@ def fit_line(x: Tensor, y: Tensor, weights: Tensor, rounds: int = FIT_ROUNDS) ->
         scale = (weights * dx * (y - mean_y)).sum() / (weights * dx * dx).sum().clamp(min=tiny)
         shift = mean_y - scale * mean_x
         error = (y - scale * x - shift).abs()
-        unit = (given * error).sum() / given.sum().clamp(min=tiny)
-        weights = given / (1 + (error / unit.clamp(min=tiny)) ** 2)
+        unit = (initial * error).sum() / initial.sum().clamp(min=tiny)
+        weights = initial / (1 + (error / unit.clamp(min=tiny)) ** 2)
     return scale, shift
 
 
-def normal_prior(known: NormalTarget, normal: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
+def normal_prior(target: NormalTarget, normal: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean over all valid pixels of alpha - <normal, N>, alpha detached; 0 where N is unknown.
 
     With rendered normals [H, W, 3] = sum w n this is the mean of sum w (1 - <n, N>): 1 - cosine, by blending weight.
     """
-    directions, valid, alpha = known.directions, known.valid, alpha.detach()
+    directions, valid, alpha = target.directions, target.valid, alpha.detach()
     if mask is not None:
         normal, alpha, valid = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha, valid))
     count = alpha.numel() if mask is None else mask.sum().clamp(min=1)

@@ -13,8 +13,8 @@ from gs2d.config.recipe import DepthPrior, NormalPrior, Recipe
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
 from gs2d.losses.base import SETTINGS, Loss, LossView
-from gs2d.losses.known_maps import Priors
 from gs2d.losses.prior_formulas import Depths, NormalTarget, depth_prior, normal_prior
+from gs2d.losses.priors import Priors
 from gs2d.render.types import RenderOutput
 
 
@@ -31,7 +31,7 @@ class _PriorLoss(Loss):
         others: dict[str, Any] = {name: None for name in SETTINGS if name != self.settings}
         self._priors = Priors(scene, replace(recipe, **others), device=device)
 
-    def known(self, output: RenderOutput, view: LossView) -> tuple[Depths | None, NormalTarget | None]:
+    def targets(self, output: RenderOutput, view: LossView) -> tuple[Depths | None, NormalTarget | None]:
         """Return the known depths and normals of a view."""
         if view.index is None:
             raise RecipeError("losses on known depths and normals need the index of the training view, got none")
@@ -46,10 +46,10 @@ class DepthPriorLoss(_PriorLoss):
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
         """Return the loss []; None for a view without known depths."""
-        known = self.known(output, view)[0]
-        if known is None:
+        target = self.targets(output, view)[0]
+        if target is None:
             return None
-        loss = depth_prior(known, output.depth(view.depth_kind), output.alpha, view.mask)
+        loss = depth_prior(target, output.depth(view.depth_kind), output.alpha, view.mask)
         return self._prior.weight_at(view.run_iteration) * loss
 
 
@@ -61,7 +61,7 @@ class NormalPriorLoss(_PriorLoss):
 
     def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
         """Return the loss []; None for a view without known normals."""
-        known = self.known(output, view)[1]
-        if known is None:
+        target = self.targets(output, view)[1]
+        if target is None:
             return None
-        return self._prior.weight_at(view.run_iteration) * normal_prior(known, output.normal, output.alpha, view.mask)
+        return self._prior.weight_at(view.run_iteration) * normal_prior(target, output.normal, output.alpha, view.mask)

@@ -46,8 +46,8 @@ def test_each_built_in_quantity_has_a_paragraph(tmp_path: Path) -> None:
 def test_a_quantity_of_another_package_is_plotted_by_its_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(QUANTITIES._things, "haze", type("Haze", (LearnedQuantity,), {"title": "Haze <of> a lens"}))
-    monkeypatch.setitem(QUANTITIES._things, "many", type("Many", (LearnedQuantity,), {}))
+    monkeypatch.setitem(QUANTITIES._objects, "haze", type("Haze", (LearnedQuantity,), {"title": "Haze <of> a lens"}))
+    monkeypatch.setitem(QUANTITIES._objects, "many", type("Many", (LearnedQuantity,), {}))
     views = {"a.jpg": {"haze": [0.1, 0.2], "many": [3.0] * 16}, "b.jpg": {"haze": [-0.3, 0.4], "many": [1.0] * 16}}
     html = str(learned_section(written(tmp_path, views, "haze", "many")))
     assert "<h3>Haze &lt;of&gt; a lens</h3>" in html

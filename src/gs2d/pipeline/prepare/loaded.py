@@ -25,8 +25,8 @@ from gs2d.errors import DataError, RecipeError, RunError, ShapeError
 from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.io.run_dir import RUN_JSON, SPLATS, RunFolder, open_run, versions
-from gs2d.losses.known_maps import DepthPlan, Priors
 from gs2d.losses.prior_formulas import NormalTarget
+from gs2d.losses.priors import DepthPlan, Priors
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_refined_poses
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import OpenCapture, capture_in_memory, open_capture, read_scene

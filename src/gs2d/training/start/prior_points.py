@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from gs2d.config.recipe import Recipe
 from gs2d.data.scene import PointCloud, Scene
-from gs2d.losses.known_maps import Priors, rays
 from gs2d.losses.prior_formulas import MetricDepth
+from gs2d.losses.priors import Priors, rays
 
 
 def with_prior_points(scene: Scene, recipe: Recipe) -> Scene:

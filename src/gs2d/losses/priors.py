@@ -18,7 +18,7 @@ from gs2d.errors import DataError
 from gs2d.losses.prior_formulas import Depths, MetricDepth, NormalTarget, PointDepths, RelativeDepths, fit_line
 
 FIT_POINTS = 10  # points in a map that its scale and shift need
-ASKED_VIEWS = 20  # views that determine the unit and the space of the maps
+SAMPLED_VIEWS = 20  # views that determine the unit and the space of the maps
 FACING = 0.9  # least fraction of normals that face the camera
 
 
@@ -35,7 +35,7 @@ class DepthPlan:
 def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
     """Choose the source of known depths of a capture, and how it is read.
 
-    Raise DataError if the capture lacks the requested source.
+    Raise DataError if the capture does not have the requested source.
     """
     mapped = [view for view in scene.train if view.maps is not None and view.maps.files.depth is not None]
     source = settings.source
@@ -43,34 +43,34 @@ def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
         metric = any(view.maps is not None and view.maps.files.metric for view in mapped)
         source = "sensor" if metric else "relative" if mapped else "sparse"
     if source == "sparse":
-        found = scene.observed(guessed=False)
-        if found is None:
+        observed = scene.observed(guessed=False)
+        if observed is None:
             raise DataError(
                 f"{scene.name} must have sparse points with the images that show them (COLMAP does), or depth maps in "
                 "depths/ or depth_file_path, got neither; train without --depth-prior"
             )
-        if not any(len(points_in(view, found, settings).depth) for view in scene.train):
+        if not any(len(points_in(view, observed, settings).depth) for view in scene.train):
             raise DataError(
                 f"no training view of {scene.name} shows a sparse point of {settings.min_track} photographs or more "
                 f"with an error up to {settings.max_error:g} px; --set depth_prior.min_track=2 takes more"
             )
-        return DepthPlan(source, found)
+        return DepthPlan(source, observed)
     if not mapped:
         raise DataError(
             f"no training view of {scene.name} has a depth map; put them in {scene.root}/depths under the names of the "
             "photographs (16-bit PNG or .npy), or name them as depth_file_path in transforms.json"
         )
-    asks = settings.unit is None if source == "sensor" else settings.align == "points"
-    observed = scene.observed(guessed=False) if asks else None
+    needs_points = settings.unit is None if source == "sensor" else settings.align == "points"
+    observed = scene.observed(guessed=False) if needs_points else None
     if source == "sensor":
         return DepthPlan(source, observed, settings.unit or _fitted_unit(mapped, observed, settings))
     space = settings.space if settings.space != "auto" else _fitted_space(mapped, observed, settings)
     return DepthPlan(source, observed, space=space)
 
 
-def _asked(mapped: list[View]) -> list[View]:
+def _sampled_views(mapped: list[View]) -> list[View]:
     """Return evenly chosen views."""
-    return mapped[:: max(1, -(-len(mapped) // ASKED_VIEWS))]
+    return mapped[:: max(1, -(-len(mapped) // SAMPLED_VIEWS))]
 
 
 def _fitted_unit(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> float | None:
@@ -80,31 +80,31 @@ def _fitted_unit(mapped: list[View], observed: ObservedPoints | None, settings: 
     """
     if observed is None:
         return None
-    ratios = [depth / values for depth, values in (_pairs(view, observed, settings) for view in _asked(mapped))]
-    found = np.concatenate(ratios)
-    if len(found) < FIT_POINTS:
+    ratios = [depth / values for depth, values in (_pairs(view, observed, settings) for view in _sampled_views(mapped))]
+    units = np.concatenate(ratios)
+    if len(units) < FIT_POINTS:
         raise DataError(
-            f"the scale of the depth maps needs {FIT_POINTS} sparse points on known pixels, got {len(found)}; set "
+            f"the scale of the depth maps needs {FIT_POINTS} sparse points on known pixels, got {len(units)}; set "
             "--set depth_prior.unit=... (units of the capture for a value of 1)"
         )
-    return float(np.median(found))
+    return float(np.median(units))
 
 
 def _fitted_space(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> str:
     """Return the space in which lines fit the maps to the points with the smaller error; disparity without points."""
     errors: dict[str, list[float]] = {"disparity": [], "depth": []}
-    for view in _asked(mapped) if observed is not None else ():
+    for view in _sampled_views(mapped) if observed is not None else ():
         assert observed is not None
         depth, values = _pairs(view, observed, settings)
-        for space, found in errors.items():
+        for space, samples in errors.items():
             line = line_of(values, depth, space)
             if line is None:
-                found.append(np.inf)
+                samples.append(np.inf)
                 continue
             on_line = line[0] * values + line[1]
             with np.errstate(divide="ignore"):
                 z = 1 / np.maximum(on_line, 0) if space == "disparity" else on_line
-            found.append(float(np.median(np.abs(z / depth - 1))))
+            samples.append(float(np.median(np.abs(z / depth - 1))))
     return "depth" if errors["depth"] and np.median(errors["depth"]) < np.median(errors["disparity"]) else "disparity"
 
 
@@ -138,11 +138,11 @@ def points_in(view: View, observed: ObservedPoints, settings: DepthPrior) -> Poi
 
 
 class Priors:
-    """Known depths and normals of each training view. The first that fit in ``limit_bytes`` are kept.
+    """Known depths and normals of each training view. The first that fit in ``limit_bytes`` are cached.
 
     The default limit is 1 GiB in host memory and 4 GiB on a device. Others are decoded each time.
 
-    The constructor raises DataError if the capture lacks what the recipe requests.
+    The constructor raises DataError if the capture does not have what the recipe requires.
     """
 
     def __init__(
@@ -156,15 +156,15 @@ class Priors:
         self._views, self._recipe, self._device = scene.train, recipe, device
         by_place = 1 << 30 if torch.device(device).type == "cpu" else 1 << 32
         self._room = cache_bytes(by_place) if limit_bytes is None else limit_bytes
-        self._kept: dict[int, tuple[Depths | None, NormalTarget | None]] = {}
+        self._cached: dict[int, tuple[Depths | None, NormalTarget | None]] = {}
         self.plan = None if recipe.depth_prior is None else plan_depths(scene, recipe.depth_prior)
         self.axes = None if recipe.normal_prior is None else plan_normals(scene, recipe.normal_prior)
 
     def at(self, index: int, dtype: torch.dtype) -> tuple[Depths | None, NormalTarget | None]:
         """Return the known depths and normals of view ``index``."""
-        kept = self._kept.get(index)
-        if kept is not None:
-            return kept
+        cached = self._cached.get(index)
+        if cached is not None:
+            return cached
         view = self._views[index]
         depth = normal = None
         if self.plan is not None:
@@ -172,11 +172,11 @@ class Priors:
             depth = metric_depths(view, self.plan, self._recipe.depth_prior, dtype, self._device)
         if self.axes is not None and view.maps is not None and view.maps.files.normal is not None:
             normal = world_normals(view, self.axes, dtype, self._device)
-        tensors = [value for known in (depth, normal) if known is not None for value in vars(known).values()]
+        tensors = [value for prior in (depth, normal) if prior is not None for value in vars(prior).values()]
         nbytes = sum(tensor.nbytes for tensor in tensors if isinstance(tensor, torch.Tensor))
         if nbytes <= self._room:
             self._room -= nbytes
-            self._kept[index] = depth, normal
+            self._cached[index] = depth, normal
         return depth, normal
 
 
@@ -249,13 +249,13 @@ def plan_normals(scene: Scene, settings: NormalPrior) -> str:
             "the photographs (RGB of (n + 1) / 2, in the camera's frame), or leave out --normal-prior"
         )
     fractions = {"opencv": [], "opengl": []}  # type: dict[str, list[float]]
-    for view in _asked(mapped):
+    for view in _sampled_views(mapped):
         assert view.maps is not None
         normals = view.maps.normal()
-        for axes, found in fractions.items():
+        for axes, shares in fractions.items():
             facing = (_in_opencv(normals, axes) * rays(view)).sum(axis=2)[(normals != 0).any(axis=2)] < 0
-            found.append(float(facing.mean()) if facing.size else 1.0)
-    means = {axes: float(np.mean(found)) for axes, found in fractions.items()}
+            shares.append(float(facing.mean()) if facing.size else 1.0)
+    means = {axes: float(np.mean(shares)) for axes, shares in fractions.items()}
     chosen = max(means, key=means.__getitem__) if settings.axes == "auto" else settings.axes
     if means[chosen] < FACING:
         raise DataError(
