@@ -18,7 +18,7 @@ from capture_writers import small_blender, small_colmap, small_dtu, small_nerfst
 from cli_runs import one_line
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
 from gs2d.cli import run
-from gs2d.core.missing import holds_photographs, suggestion
+from gs2d.core.missing import has_photographs, suggestion
 from gs2d.data import detect_format
 
 NEEDS = {  # what each command reads
@@ -142,7 +142,7 @@ def test_a_run_without_scale_gets_one_and_then_an_orthophoto(there: Path, capsys
 def test_captures_of_every_format_are_distinguished_from_photographs_by_name(tmp_path: Path, write: object) -> None:
     write(tmp_path / "some")  # type: ignore[operator]
     assert detect_format(tmp_path / "some")
-    assert not holds_photographs(tmp_path / "some")
+    assert not has_photographs(tmp_path / "some")
     assert suggestion(tmp_path / "some", "run").startswith("; `gs2d train ")
 
 

@@ -16,7 +16,7 @@ from gs2d.cli import run
 from gs2d.data.readers.colmap import ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.sfm.colmap_process import MatchFacts, Request, check_installed, solve
+from gs2d.sfm.colmap_process import MatchCounts, Request, check_installed, solve
 from gs2d.sfm.model import SfmModel, why_not_placed
 from gs2d.sfm.workspace import check_out, put_in_place, workspace
 
@@ -28,7 +28,7 @@ def piece(*names: str) -> SfmModel:
 
 
 FEATURES = {**dict.fromkeys("abcdefg", 900), "blurred": 7}
-FACTS = MatchFacts(
+COUNTS = MatchCounts(
     FEATURES,
     {("a", "b"): 300, ("a", "c"): 250, ("d", "a"): 17, ("d", "b"): 21, ("e", "f"): 400, ("g", "blurred"): 16},
 )
@@ -47,8 +47,8 @@ PIECES = [piece("a", "b", "c"), piece("x", "y", "z")]
     ],
 )
 def test_the_reason_for_an_unplaced_photograph(name: str, expected: str) -> None:
-    facts = MatchFacts({**FEATURES, "lonely": 500, "y": 900}, FACTS.matches)
-    assert why_not_placed(name, PIECES, facts) == expected
+    counts = MatchCounts({**FEATURES, "lonely": 500, "y": 900}, COUNTS.matches)
+    assert why_not_placed(name, PIECES, counts) == expected
 
 
 # -- the worker --------------------------------------------------------------------------------------------------------

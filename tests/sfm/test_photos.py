@@ -14,7 +14,7 @@ from gs2d.errors import DataError
 from gs2d.sfm.colmap_worker import up_direction
 from gs2d.sfm.compare import near_pairs, neighbour_pairs, similar_pairs
 from gs2d.sfm.copies import copy_images
-from gs2d.sfm.photos import Photo, camera_groups, find_photos, in_order_taken, read_photos, turn
+from gs2d.sfm.photos import Photo, camera_groups, chronological_order, find_photos, read_photos, turn
 
 DETAILS = ExifTags.IFD.Exif
 
@@ -235,8 +235,8 @@ def test_images_are_ordered_by_time_if_all_have_one(tmp_path: Path) -> None:
     for name, second in (("DSC_9998", 1), ("DSC_9999", 2), ("DSC_0001", 3), ("DSC_0002", 4)):
         image(tmp_path / f"{name}.jpg", time=f"2026:05:01 10:00:0{second}")
     photos = photos_of(tmp_path)
-    order, by = in_order_taken(photos)
+    order, by = chronological_order(photos)
     assert [photos[i].name for i in order] == ["DSC_9998.jpg", "DSC_9999.jpg", "DSC_0001.jpg", "DSC_0002.jpg"]
     assert by == "time"
     image(tmp_path / "DSC_0003.jpg")
-    assert in_order_taken(photos_of(tmp_path)) == ([0, 1, 2, 3, 4], "name")
+    assert chronological_order(photos_of(tmp_path)) == ([0, 1, 2, 3, 4], "name")

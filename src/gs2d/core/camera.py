@@ -56,11 +56,11 @@ class Camera:
     intrinsics: Tensor | None = None  # [4]
 
     def __post_init__(self) -> None:
-        given: Any = self.T_cam_world
-        if hasattr(given, "requires_grad"):  # a torch tensor; this module does not import torch
-            object.__setattr__(self, "pose", given if given.requires_grad else None)
-            given = given.detach().cpu().numpy()
-        T = np.array(given, dtype=np.float64)  # a copy: an optimizer that changes the tensor must not move the camera
+        matrix: Any = self.T_cam_world
+        if hasattr(matrix, "requires_grad"):  # a torch tensor; this module does not import torch
+            object.__setattr__(self, "pose", matrix if matrix.requires_grad else None)
+            matrix = matrix.detach().cpu().numpy()
+        T = np.array(matrix, dtype=np.float64)  # a copy: an optimizer that changes the tensor must not move the camera
         if T.shape != (4, 4):
             raise ShapeError(f"T_cam_world must be [4, 4], got {list(T.shape)}")
         if not (np.isfinite(T).all() and np.allclose(T[3], (0, 0, 0, 1), atol=1e-6)):

@@ -36,12 +36,12 @@ def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
     ``root`` is the folder of ``proc`` and ``sys``.
     """
     mapped, resident = _own_pages(root)
-    found = [MemoryLimit(limit, resident, source) for limit, source in (*_cgroups(root), *_physical(root))]
+    limits = [MemoryLimit(limit, resident, source) for limit, source in (*_cgroups(root), *_physical(root))]
     addresses = address_space()
     if addresses is not None:
-        found.append(MemoryLimit(addresses, mapped, "the limit on address space, ulimit -v"))
-    found += [MemoryLimit(budget, resident, "--memory") for budget in _budget]
-    return min(found, key=lambda limit: limit.room, default=None)
+        limits.append(MemoryLimit(addresses, mapped, "the limit on address space, ulimit -v"))
+    limits += [MemoryLimit(budget, resident, "--memory") for budget in _budget]
+    return min(limits, key=lambda limit: limit.room, default=None)
 
 
 _budget: list[int] = []  # at most one value: the limit set by the user
@@ -60,10 +60,10 @@ def memory_budget() -> int | None:
     return None if limit is None else int(BUDGET_FRACTION * limit.bytes)
 
 
-def cache_bytes(wanted: int) -> int:
-    """Return the size of a cache in bytes: ``wanted``, or less if memory is limited."""
+def cache_bytes(requested: int) -> int:
+    """Return the size of a cache in bytes: ``requested``, or less if memory is limited."""
     limit = memory_limit()
-    return wanted if limit is None else min(wanted, int(CACHE_FRACTION * limit.room))
+    return requested if limit is None else min(requested, int(CACHE_FRACTION * limit.room))
 
 
 def _own_pages(root: Path) -> tuple[int, int]:

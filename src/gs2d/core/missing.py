@@ -51,15 +51,15 @@ def suggestion(path: Path, needed: str) -> str:
     here = [path, *list(path.parents)[:_UP]]
     run = next((folder for folder in here if (folder / "run.json").is_file()), None) or _run_in(path)
     tried = needed == "capture" and path.is_dir()
-    capture = next((folder for folder in here[tried:] if _holds_capture(folder)), None)
+    capture = next((folder for folder in here[tried:] if _has_capture(folder)), None)
     photos = path.parent if path.suffix.lower() in _PHOTOS else path
-    photos = photos if holds_photographs(photos) else photos / "images"
+    photos = photos if has_photographs(photos) else photos / "images"
     if needed == "run":
         if run is not None:
             return f"; give the run folder {run}"
         if capture is not None:
             return f"; `gs2d train {_quoted(capture)} --out RUN` makes a run of it"
-        if holds_photographs(photos):
+        if has_photographs(photos):
             return _with_cameras(photos)
         return "; give a folder that `gs2d train` or `gs2d reconstruct` made"
     if capture is None and run is not None:
@@ -67,10 +67,10 @@ def suggestion(path: Path, needed: str) -> str:
     if needed == "capture":
         if capture is not None:
             return f"; give the capture {capture}"
-        return _with_cameras(photos) if holds_photographs(photos) else "; give photographs with their cameras"
-    if capture is not None and holds_photographs(capture / "images"):
+        return _with_cameras(photos) if has_photographs(photos) else "; give photographs with their cameras"
+    if capture is not None and has_photographs(capture / "images"):
         return f"; give the folder of its photographs, {capture / 'images'}"
-    if not holds_photographs(photos):
+    if not has_photographs(photos):
         return "; give a folder of photographs, or a video"
     return f"; give the folder {photos}" if photos.is_dir() else _with_cameras(photos)
 
@@ -80,9 +80,9 @@ def belongs_to_run(path: Path) -> bool:
     for folder in (path, *list(path.parents)[:_UP]):
         if (folder / "run.json").is_file():
             return True
-        if _holds_capture(folder):
+        if _has_capture(folder):
             return False
-    return _run_in(path) is not None and not holds_photographs(path)
+    return _run_in(path) is not None and not has_photographs(path)
 
 
 def _run_in(folder: Path) -> Path | None:
@@ -90,13 +90,13 @@ def _run_in(folder: Path) -> Path | None:
     return next(iter(sorted(path.parent for path in folder.glob("*/run.json"))), None)
 
 
-def holds_photographs(path: Path) -> bool:
+def has_photographs(path: Path) -> bool:
     """Whether a folder contains images but no cameras, by file names."""
     names = _names_in(path)
-    return any(name.lower().endswith(_PHOTOS) for name in names) and _SOG not in names and not _holds_capture(path)
+    return any(name.lower().endswith(_PHOTOS) for name in names) and _SOG not in names and not _has_capture(path)
 
 
-def _holds_capture(path: Path) -> bool:
+def _has_capture(path: Path) -> bool:
     return any(fnmatch.fnmatch(name.lower(), pattern) for name in _names_in(path) for pattern in _CAPTURES)
 
 

@@ -93,8 +93,8 @@ def turns_of_harmonics(degree: int) -> Tensor:
     for k in range(count):
         (slope,) = torch.autograd.grad(basis[:, k].sum(), directions, retain_graph=True)
         changes.append(torch.linalg.cross(directions.detach(), slope))
-    wanted = torch.stack(changes, dim=2).flatten(1)  # [10 (K-1), 3 (K-1)]
-    turns = torch.linalg.lstsq(basis.detach(), wanted).solution.T.reshape(3, count, count)
+    derivatives = torch.stack(changes, dim=2).flatten(1)  # [10 (K-1), 3 (K-1)]
+    turns = torch.linalg.lstsq(basis.detach(), derivatives).solution.T.reshape(3, count, count)
     return turns.sign() * ((4 * turns * turns).round() / 4).sqrt()
 
 

@@ -60,7 +60,7 @@ class Spilled(Sequence[T], Generic[T]):
     """
 
     def __init__(self, values: Iterable[T], limit_bytes: int) -> None:
-        self._kept: list[T] = []
+        self._resident: list[T] = []
         self._slots: list[tuple[int, int]] = []
         self._file = SpillFile()
         self._read: Callable[[tuple[int, int]], T] = lru_cache(RECENT)(self._file.get)
@@ -69,17 +69,17 @@ class Spilled(Sequence[T], Generic[T]):
             packed = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
             if not self._slots and len(packed) <= room:
                 room -= len(packed)
-                self._kept.append(value)
+                self._resident.append(value)
             else:
                 self._slots.append(self._file.put(packed))
 
     def __len__(self) -> int:
-        return len(self._kept) + len(self._slots)
+        return len(self._resident) + len(self._slots)
 
     @property
     def in_memory(self) -> int:
         """Number of values in memory."""
-        return len(self._kept)
+        return len(self._resident)
 
     @overload
     def __getitem__(self, index: int) -> T: ...
@@ -89,7 +89,7 @@ class Spilled(Sequence[T], Generic[T]):
         if isinstance(index, slice):
             return [self[at] for at in range(*index.indices(len(self)))]
         at = range(len(self))[index]
-        return self._kept[at] if at < len(self._kept) else self._read(self._slots[at - len(self._kept)])
+        return self._resident[at] if at < len(self._resident) else self._read(self._slots[at - len(self._resident)])
 
     def column(self, number: int) -> Sequence[Any]:
         """Return the sequence of one entry of each value; values are tuples."""

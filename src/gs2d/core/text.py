@@ -29,8 +29,8 @@ def printable(text: str, *, lines: bool = False) -> str:
     return (_HIDDEN_IN_LINES if lines else _HIDDEN).sub(_spelled, text)
 
 
-def _spelled(found: re.Match[str]) -> str:
-    code = ord(found[0])
+def _spelled(match: re.Match[str]) -> str:
+    code = ord(match[0])
     if 0xDC80 <= code <= 0xDCFF:  # a byte
         code -= 0xDC00
     named = {0x09: "\\t", 0x0A: "\\n", 0x0D: "\\r"}

@@ -154,14 +154,14 @@ def _last_words(phase: str, code: int, log: Path) -> str:
 
 
 @dataclass(frozen=True)
-class MatchFacts:
+class MatchCounts:
     """Number of features of each image, and of verified matches of each pair that has any."""
 
     features: dict[str, int]
     matches: dict[tuple[str, str], int]
 
 
-def read_facts(database: Path) -> MatchFacts:
+def read_match_counts(database: Path) -> MatchCounts:
     """Read the database of a finished worker.
 
     A pair's number is 2147483647 * (smaller image id) + (larger one) (COLMAP's documentation, Database Format). Raises
@@ -172,11 +172,11 @@ def read_facts(database: Path) -> MatchFacts:
             names = dict(connection.execute("SELECT image_id, name FROM images"))
             features = dict.fromkeys(names.values(), 0)
             features |= {names[i]: rows for i, rows in connection.execute("SELECT image_id, rows FROM keypoints")}
-            found = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
-            matches = {(names[pair // 2147483647], names[pair % 2147483647]): rows for pair, rows in found}
+            pairs = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
+            matches = {(names[pair // 2147483647], names[pair % 2147483647]): rows for pair, rows in pairs}
     except (sqlite3.Error, KeyError) as error:
         raise DataError(
             f"cannot read the COLMAP database {database}: {error}; free some disk space, or remove {database.parent} "
             "and start again"
         ) from error
-    return MatchFacts(features, matches)
+    return MatchCounts(features, matches)

@@ -68,7 +68,7 @@ def main(request_path: str) -> None:
     pycolmap.logging.minloglevel = int(pycolmap.logging.WARNING)
     pycolmap.set_random_seed(request["seed"])
     steps = Steps(Path(request["database"]).with_name(MAPPING))
-    if steps.facts("first") is None:
+    if steps.result("first") is None:
         find_features(pycolmap, request, say)
         match(pycolmap, request, say)
     say(**map_(pycolmap, request, steps, say))
@@ -78,19 +78,19 @@ def map_(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> dict
     """Estimate cameras and points from the matches; each connected set of images becomes a model.
 
     Each step reads the result of the step before it and is skipped if it is already finished. The result has
-    ``models``, the facts of each model, largest first, and ``lens``, the lens that was chosen.
+    ``models``, the statistics of each model, largest first, and ``lens``, the lens that was chosen.
     """
-    if steps.facts(FISHEYES) is None:
+    if steps.result(FISHEYES) is None:
         settle_fisheyes(pycolmap, request, steps, say)
-    if steps.facts("first") is None:
+    if steps.result("first") is None:
         steps.finish("first", _first_models(pycolmap, request, steps, say))
-    names = steps.facts("first") or []
+    names = steps.result("first") or []
     lens: dict[str, Any] = {}
     if names:
-        if steps.facts("lens") is None:
+        if steps.result("lens") is None:
             _settle_lens(pycolmap, request, names[0], steps, say)
-        lens = steps.facts("lens") or {}
-        if steps.facts("extended") is None:
+        lens = steps.result("lens") or {}
+        if steps.result("extended") is None:
             _extend(pycolmap, request, steps, say)
         names = ["extended", *names[1:]]
     shutil.rmtree(request["output"], ignore_errors=True)
@@ -120,7 +120,7 @@ def _first_models(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say
     names, most = [], 0
     attempts = (AT_ONCE,) if request["mapper"] == "global" else tuple(ATTEMPTS)
     for attempt in attempts:
-        if (sizes := steps.facts(f"tried {attempt}")) is None:
+        if (sizes := steps.result(f"tried {attempt}")) is None:
             sizes = _attempt(pycolmap, request, steps, say, attempt)
             steps.finish(f"tried {attempt}", sizes)
         if (placed := max(sizes.values(), default=0)) > CLEARLY * most:
@@ -189,7 +189,7 @@ def _extend(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> N
 
 
 def _write(pycolmap: Any, model: Any, folder: Path) -> dict[str, Any]:
-    """Rotate a model so that +z is up, and write it; returns its facts."""
+    """Rotate a model so that +z is up, and write it; returns its statistics."""
     images = [image for _, image in sorted(model.images.items()) if image.has_pose]
     up = up_direction(np.stack([image.cam_from_world().rotation.matrix() for image in images]))
     if up is not None:

@@ -22,7 +22,7 @@ from gs2d.sfm.search import count, read_only
 
 Say = Callable[..., None]
 ALIKE = "alike.json"  # beside the database: pairs of similar images
-LESS_NEXT, LESS_ALIKE = 3, 4  # divisors for consecutive and similar images if positions are known (notebook/sfm.md)
+LESS_NEXT, LESS_ALIKE = 3, 4  # divisors for consecutive and similar images if positions are available (notebook/sfm.md)
 
 
 def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
@@ -127,7 +127,7 @@ def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> dict[str, set[tu
 
 
 def _alike(request: dict[str, Any]) -> list[int]:
-    """Return the number of similar images to match each image with: fewer if its position is known."""
+    """Return the number of similar images to match each image with: fewer if it has a position."""
     many = int(request["neighbours"])
     if request["matching"] != "spatial":
         return [many] * len(request["in_order"])
@@ -135,10 +135,10 @@ def _alike(request: dict[str, Any]) -> list[int]:
 
 
 def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int, int]]:
-    """Return pairs of similar images; kept in a file for an interrupted search."""
-    kept = Path(request["database"]).with_name(ALIKE)
-    if kept.exists():
-        return {(i, j) for i, j in json.loads(kept.read_text(encoding="utf-8"))}
+    """Return pairs of similar images; stored in a file for an interrupted search."""
+    cache = Path(request["database"]).with_name(ALIKE)
+    if cache.exists():
+        return {(i, j) for i, j in json.loads(cache.read_text(encoding="utf-8"))}
     database = pycolmap.Database.open(request["database"])
     try:
         ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -151,7 +151,7 @@ def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int,
         pairs = similar_pairs(read, len(names), neighbours=_alike(request), seed=request["seed"])
     finally:
         database.close()
-    with atomic_write(kept, "w") as file:
+    with atomic_write(cache, "w") as file:
         json.dump(sorted(pairs), file)
     return pairs
 
@@ -183,16 +183,16 @@ def near_pairs(positions: Sequence[Sequence[float] | None], neighbours: int) -> 
 
     ``positions`` [3]: metres; None if unknown. ``neighbours``: number of nearest images to pair each image with.
     """
-    known = [i for i, position in enumerate(positions) if position is not None]
-    if len(known) < 2:
+    located = [i for i, position in enumerate(positions) if position is not None]
+    if len(located) < 2:
         return set()
-    at = np.array([positions[i] for i in known], dtype=float)
-    count = min(neighbours, len(known) - 1)
-    _, found = cKDTree(at).query(at, k=count + 1)
+    at = np.array([positions[i] for i in located], dtype=float)
+    count = min(neighbours, len(located) - 1)
+    _, nearest = cKDTree(at).query(at, k=count + 1)
     pairs = set()
-    for row, others in enumerate(np.atleast_2d(found)):  # with equal positions, the image itself need not be first
+    for row, others in enumerate(np.atleast_2d(nearest)):  # with equal positions, the image itself need not be first
         for other in [j for j in others if j != row][:count]:
-            pairs.add((known[min(row, other)], known[max(row, other)]))
+            pairs.add((located[min(row, other)], located[max(row, other)]))
     return pairs
 
 

@@ -72,24 +72,24 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> None:
     if image.size != size:
         premultiplied = image.convert("RGBa") if image.mode == "RGBA" else image
         image = premultiplied.resize(size, Image.Resampling.LANCZOS).convert(image.mode)
-    kept = _kept(photo.source)
+    metadata = _metadata(photo.source)
     with atomic_write(target) as out:
         if target.suffix.lower() in JPEG:
-            image.save(out, "JPEG", quality=QUALITY, subsampling=0, **kept)
+            image.save(out, "JPEG", quality=QUALITY, subsampling=0, **metadata)
         else:
-            image.save(out, "PNG", **kept)
+            image.save(out, "PNG", **metadata)
 
 
-def _kept(source: Path) -> dict[str, bytes]:
+def _metadata(source: Path) -> dict[str, bytes]:
     """Return the colour profile (of RGB images only) and EXIF block of an image, for Pillow's ``save``."""
     with open_image(source) as file:
         profile = file.info.get("icc_profile") if file.mode in ("RGB", "RGBA") else None
-        kept = {"icc_profile": profile} if profile else {}
+        metadata = {"icc_profile": profile} if profile else {}
         with contextlib.suppress(*DAMAGED_EXIF):
             exif = file.getexif()
             exif.pop(ExifTags.Base.Orientation, None)
-            kept["exif"] = exif.tobytes()
-    return kept
+            metadata["exif"] = exif.tobytes()
+    return metadata
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[
 
     ``root``: folder of the photographs. Masks are searched in ``masks`` inside or beside it or in its sub-folders, and
     as ``STEM_mask.png`` or ``NAME.mask.png``. ``folder``: folder of the masks (``--masks``), instead of the search.
-    Raises DataError if ``folder`` does not exist or holds no mask of these photographs.
+    Raises DataError if ``folder`` does not exist or has no mask of these photographs.
     """
     if folder is not None and not folder.is_dir():
         raise DataError(f"--masks must be a folder of masks, got {folder}, which does not exist")
@@ -120,19 +120,19 @@ def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Pa
 
     Raises DataError if a mask and its photograph differ in shape, or all masks are completely black.
     """
-    count, kept = 0, False
+    count, has_white = 0, False
     for photo, path in zip(photos, masks, strict=True):
         if path is None:
             continue
         target = folder / f"{photo.name}.png"
         if target.exists():  # from an interrupted search
-            count, kept = count + 1, True
+            count, has_white = count + 1, True
             continue
         make_folder(target.parent)
         mask = _resized(_upright(photo, path), photo.size_within(max_size))
         write_image(target, mask)
-        count, kept = count + 1, kept or bool(mask.any())
-    if count == len(photos) and not kept:
+        count, has_white = count + 1, has_white or bool(mask.any())
+    if count == len(photos) and not has_white:
         raise DataError(f"masks must have white pixels (white = keep), got {count} completely black ones; invert them")
     return count
 
@@ -156,7 +156,7 @@ def _upright(photo: Photo, path: Path) -> np.ndarray:
     if _alike(size, stored):  # masks are assumed to match the stored pixels: a rotation by 180 degrees is ambiguous
         mask = Image.fromarray(read_mask(path).astype(np.uint8))
         return np.asarray(turn(mask, photo.orientation)) > 0
-    if _alike(size, photo.size):  # made by a program that rotates photographs upright
+    if _alike(size, photo.size):  # written by a program that rotates photographs upright
         return read_mask(path)
     raise DataError(
         f"mask {path} must have the size or aspect ratio of {photo.label}, {stored[0]}x{stored[1]}, got "

@@ -74,11 +74,11 @@ def is_plausible(params: Sequence[float], width: int, height: int) -> bool:
 # therefore verified with the lens ``START`` first, then again as rays of a fisheye with the estimated focal length.
 Say = Callable[..., None]
 FISHEYE = "OPENCV_FISHEYE"
-USUAL = 75.0  # degrees from the axis to the corner, if neither matches nor EXIF tell the focal length
+USUAL = 75.0  # degrees from the axis to the corner, if neither matches nor EXIF determine the focal length
 
 
 def settle_fisheyes(pycolmap: Any, request: Mapping[str, Any], steps: Steps, say: Say) -> None:
-    """Step ``FISHEYES``: store each camera in the database as a fisheye, if the request asks for that."""
+    """Step ``FISHEYES``: store each camera in the database as a fisheye, if requested."""
     if request["asked_lens"] == FISHEYE:
         groups = enumerate(request["groups"], start=1)
         numbers = [i for i, group in groups if group["camera_model"] != PANORAMA]
@@ -91,14 +91,14 @@ def _fisheye(pycolmap: Any, request: Mapping[str, Any], number: int) -> Any:
     width, height = request["groups"][number - 1]["size"]
     database = pycolmap.Database.open(request["database"])
     try:
-        known = database.read_camera(number)
-        camera = pycolmap.Camera.create_from_model_name(number, FISHEYE, known.mean_focal_length(), width, height)
+        stored = database.read_camera(number)
+        camera = pycolmap.Camera.create_from_model_name(number, FISHEYE, stored.mean_focal_length(), width, height)
         focal = fisheye_focal(pycolmap, database, camera, seed=request["seed"])
     finally:
         database.close()
     if focal is None:
         usual = math.hypot(width, height) / 2 / math.radians(USUAL)
-        focal = known.mean_focal_length() if known.has_prior_focal_length else usual
+        focal = stored.mean_focal_length() if stored.has_prior_focal_length else usual
     camera.params = [focal, focal, *camera.params[2:]]
     camera.has_prior_focal_length = True
     return camera
@@ -154,10 +154,10 @@ def fisheye_focal(pycolmap: Any, database: Any, camera: Any, *, seed: int) -> fl
     def share(angle: float) -> float:
         return _share(pycolmap, (reach / math.radians(angle), *centre), size, matches, seed)
 
-    found = {angle: share(angle) for angle in ANGLES}
-    coarse = max(found, key=found.__getitem__)
-    found |= {coarse + more: share(coarse + more) for more in BESIDE}
-    return reach / math.radians(max(found, key=found.__getitem__))
+    shares = {angle: share(angle) for angle in ANGLES}
+    coarse = max(shares, key=shares.__getitem__)
+    shares |= {coarse + more: share(coarse + more) for more in BESIDE}
+    return reach / math.radians(max(shares, key=shares.__getitem__))
 
 
 def _matches(pycolmap: Any, database: Any, camera: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -167,14 +167,14 @@ def _matches(pycolmap: Any, database: Any, camera: int, seed: int) -> list[tuple
     pairs = [(count, *pycolmap.pair_id_to_image_pair(pair)) for pair, count in zip(numbers, counts, strict=True)]
     pairs = sorted((pair for pair in pairs if pair[0] >= FEWEST and {*pair[1:]} <= images), reverse=True)
     chosen = np.unique(np.linspace(0, OVERLAP * max(len(pairs) - 1, 0), PAIRS).astype(int)) if pairs else ()
-    rng, found = np.random.Generator(np.random.Philox(key=seed)), []
+    rng, matches = np.random.Generator(np.random.Philox(key=seed)), []
     for i in chosen:
         _, first, second = pairs[i]
         rows = np.asarray(database.read_matches(first, second))
         rows = rows[np.sort(rng.permutation(len(rows))[:MATCHES])]
         places = [database.read_keypoints(image)[:, :2].astype(float) for image in (first, second)]
-        found.append((places[0][rows[:, 0]], places[1][rows[:, 1]]))
-    return found
+        matches.append((places[0][rows[:, 0]], places[1][rows[:, 1]]))
+    return matches
 
 
 def _share(

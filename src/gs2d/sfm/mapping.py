@@ -27,17 +27,17 @@ class Steps:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
 
-    def facts(self, name: str) -> Any | None:
+    def result(self, name: str) -> Any | None:
         """Return the result of a finished step, or None."""
         try:
             return json.loads((self.folder / f"{name}.json").read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
 
-    def finish(self, name: str, facts: Any) -> None:
+    def finish(self, name: str, result: Any) -> None:
         """Record that a step is finished, with its result."""
         with atomic_write(self.folder / f"{name}.json", "w") as file:
-            json.dump(facts, file)
+            json.dump(result, file)
 
     def write(self, name: str, model: Any) -> None:
         """Write a model (pycolmap.Reconstruction), replacing one of the same name."""
@@ -108,7 +108,7 @@ def map_globally(pycolmap: Any, request: dict[str, Any], steps: Steps, name: str
     If EXIF does not state every focal length, they are estimated from all pairs first: rotations depend on them.
     """
     database = request["database"]
-    if steps.facts(CALIBRATED) is None:
+    if steps.result(CALIBRATED) is None:
         if not _has_all_focal_lengths(database):
             options = pycolmap.ViewGraphCalibrationOptions()
             options.random_seed = request["seed"]

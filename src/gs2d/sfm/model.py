@@ -22,7 +22,7 @@ from gs2d.data.readers.colmap import (
 )
 from gs2d.data.undistort import colmap_intrinsics
 from gs2d.errors import DataError
-from gs2d.sfm.colmap_process import MatchFacts
+from gs2d.sfm.colmap_process import MatchCounts
 from gs2d.sfm.lens import PANORAMA
 
 _MAX_ANGLES = 2000
@@ -50,7 +50,7 @@ class SfmModel:
 
 
 def read_model(folder: Path, done: Mapping[str, Any]) -> SfmModel:
-    """Read a model that the worker wrote; ``done`` are its facts."""
+    """Read a model that the worker wrote; ``done`` are its statistics."""
     points = read_points(folder, "bin")
     images = sorted(read_images(folder, "bin", observations=True), key=lambda image: image.name)
     assert points is not None  # the worker writes no model without points
@@ -80,53 +80,53 @@ def _median_angle(images: Sequence[ColmapImage], points: ColmapPoints) -> float:
     return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))) if cosines else 0.0
 
 
-def check_any(pieces: Sequence[SfmModel], facts: MatchFacts, root: Path) -> None:
+def check_any(pieces: Sequence[SfmModel], counts: MatchCounts, root: Path) -> None:
     """Raise DataError if there is no model; the message names the step that failed and a remedy."""
     if pieces:
         return
-    features = sorted(facts.features.values())
+    features = sorted(counts.features.values())
     if features[len(features) // 2] < FEW_FEATURES:
         raise DataError(
             f"{root} must hold photographs with texture, got {features[len(features) // 2]} features in the median "
             f"photograph (expected {FEW_FEATURES} or more): they are blurred or dark, or show plain surfaces; use more "
             "light and a patterned base"
         )
-    if not facts.matches:
+    if not counts.matches:
         raise DataError(
-            f"{root} must hold photographs that overlap, got {len(facts.features)} without a single matching pair; "
+            f"{root} must hold photographs that overlap, got {len(counts.features)} without a single matching pair; "
             f"{_SHOOTING}"
         )
-    best = max(facts.matches.values())
-    together = _largest_group(facts)
-    if 2 * together < len(facts.features):
+    best = max(counts.matches.values())
+    connected = _largest_group(counts)
+    if 2 * connected < len(counts.features):
         raise DataError(
-            f"{root} must hold photographs that overlap, but at most {together} of {len(facts.features)} are connected "
-            f"by matches: the steps between them are too large; {_SHOOTING}"
+            f"{root} must hold photographs that overlap, but at most {connected} of {len(counts.features)} are "
+            f"connected by matches: the steps between them are too large; {_SHOOTING}"
         )
     raise DataError(
-        f"{root} must hold photographs from different positions: {len(facts.matches)} pairs match (up to {best} "
+        f"{root} must hold photographs from different positions: {len(counts.matches)} pairs match (up to {best} "
         f"points), but none from two positions far enough apart; do not just rotate the camera: {_SHOOTING}"
     )
 
 
-def _largest_group(facts: MatchFacts) -> int:
+def _largest_group(counts: MatchCounts) -> int:
     """Return the size of the largest set of images that is connected by matches."""
     groups: list[set[str]] = []
-    for pair in facts.matches:
+    for pair in counts.matches:
         touched = [group for group in groups if not group.isdisjoint(pair)]
         groups = [group for group in groups if group.isdisjoint(pair)] + [set(pair).union(*touched)]
     return max(map(len, groups), default=1)
 
 
-def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: MatchFacts) -> str:
+def why_not_placed(name: str, pieces: Sequence[SfmModel], counts: MatchCounts) -> str:
     """Return the most likely reason why an image has no camera in the first model."""
     for number, piece in enumerate(pieces[1:], start=1):
         if name in piece.names:
             return f"in a separate model (sparse/{number}): too few matches with the photographs of sparse/0"
-    features = facts.features.get(name, 0)
+    features = counts.features.get(name, 0)
     if features < FEW_FEATURES:
         return f"{features} features: blurred, or without texture"
-    partners = {a if b == name else b: rows for (a, b), rows in facts.matches.items() if name in (a, b)}
+    partners = {a if b == name else b: rows for (a, b), rows in counts.matches.items() if name in (a, b)}
     if not partners:
         return "no matches with any other photograph"
     placed = {other: rows for other, rows in partners.items() if other in pieces[0].names}

@@ -50,12 +50,12 @@ class Photo:
     # converted.
     name: str
     size: tuple[int, int]  # width and height of the upright image, px
-    taken: Taken  # metadata of the file; ``orientation`` is the rotation that remains to be applied
+    metadata: Taken  # ``orientation`` is the rotation that remains to be applied
 
     @property
     def orientation(self) -> int:
         """EXIF orientation, 1 (upright) to 8."""
-        return self.taken.orientation
+        return self.metadata.orientation
 
     @property
     def is_converted(self) -> bool:
@@ -126,15 +126,15 @@ def _files(root: Path) -> Iterator[Path]:
     def refuse(error: OSError) -> None:
         raise DataError(f"cannot read the folder {error.filename}: {error.strerror}") from error
 
-    found, entered = [], {os.path.realpath(root)}
+    files, entered = [], {os.path.realpath(root)}
     for folder, folders, names in os.walk(root, onerror=refuse, followlinks=True):
         visible = {
             name: os.path.realpath(os.path.join(folder, name)) for name in folders if not name.startswith(_HIDDEN)
         }
         folders[:] = [name for name, path in visible.items() if path not in entered]  # avoid cycles of links
         entered.update(visible.values())
-        found += [Path(folder, name) for name in names if not name.startswith(".")]
-    yield from sorted(found, key=lambda path: natural_key(path.relative_to(root).as_posix()))
+        files += [Path(folder, name) for name in names if not name.startswith(".")]
+    yield from sorted(files, key=lambda path: natural_key(path.relative_to(root).as_posix()))
 
 
 def _some(paths: Sequence[Path], root: Path) -> str:
@@ -155,24 +155,24 @@ def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[
 
 def _read(path: Path, root: Path, name: str) -> Photo:
     height, width = read_image(path).shape[:2]
-    taken = read_taken(path)
-    orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else taken.orientation  # Pillow rotates TIFF itself
+    metadata = read_taken(path)
+    orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else metadata.orientation  # Pillow rotates TIFF itself
     size = (height, width) if orientation >= 5 else (width, height)
-    taken = replace(taken, orientation=orientation)
-    return Photo(path, path.relative_to(root).as_posix(), name, size, taken)
+    metadata = replace(metadata, orientation=orientation)
+    return Photo(path, path.relative_to(root).as_posix(), name, size, metadata)
 
 
 def _names(labels: Sequence[str]) -> list[str]:
     """Return unique names for the capture: white space becomes ``_``, invalid UTF-8 ``?``."""
     names: list[str] = []
-    taken = set()
+    used = set()
     for label in labels:
         name = "_".join(label.split()).encode("utf-8", "replace").decode("utf-8")
         if Path(name).suffix.lower() in CONVERTED:
             name += ".png"
-        while name.lower() in taken:  # some file systems ignore case
+        while name.lower() in used:  # some file systems ignore case
             name = str(Path(name).with_name(f"_{Path(name).name}").as_posix())
-        taken.add(name.lower())
+        used.add(name.lower())
         names.append(name)
     return names
 
@@ -200,7 +200,7 @@ def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cam
         return [list(range(len(photos)))]
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, (photo, size) in enumerate(zip(photos, sizes, strict=True)):
-        groups.setdefault((os.path.dirname(photo.name), size, photo.taken.made_by), []).append(i)
+        groups.setdefault((os.path.dirname(photo.name), size, photo.metadata.made_by), []).append(i)
     return list(groups.values())
 
 
@@ -215,18 +215,18 @@ def panorama_groups(
     """
     if camera_model not in ("auto", PANORAMA):
         return [False] * len(groups), []
-    found, doubted = [], 0
+    flags, doubted = [], 0
     for group in groups:
         first = photos[group[0]]
-        said = [photos[i].taken.panorama for i in group]
-        is_one = camera_model == PANORAMA or "whole" in said
-        if "part" in said:
-            raise _not_whole(photos[group[said.index("part")]], "as its XMP says")
+        tags = [photos[i].metadata.panorama for i in group]
+        is_one = camera_model == PANORAMA or "whole" in tags
+        if "part" in tags:
+            raise _not_whole(photos[group[tags.index("part")]], "as its XMP says")
         if is_one and not is_twice_as_wide(*first.size):
             raise _not_whole(first, "which is not twice as wide as high")
-        found.append(is_one)
+        flags.append(is_one)
         doubted += 0 if is_one or not is_twice_as_wide(*first.size) else len(group)
-    count = sum(len(group) for group, is_one in zip(groups, found, strict=True) if is_one)
+    count = sum(len(group) for group, is_one in zip(groups, flags, strict=True) if is_one)
     about = f"{count} photographs are 360-degree panoramas: each has one pose, and is trained as several faces"
     lines = [about] if count else []
     if doubted:
@@ -234,7 +234,7 @@ def panorama_groups(
             f"{doubted} photographs have an aspect ratio of 2:1, but no XMP tag of panoramas: not treated as panoramas "
             f"(use --camera-model {PANORAMA} if they are)"
         )
-    return found, lines
+    return flags, lines
 
 
 def _not_whole(photo: Photo, why: str) -> DataError:
@@ -245,16 +245,15 @@ def _not_whole(photo: Photo, why: str) -> DataError:
     )
 
 
-def in_order_taken(photos: Sequence[Photo]) -> tuple[list[int], str]:
+def chronological_order(photos: Sequence[Photo]) -> tuple[list[int], str]:
     """Return the indices of the photographs in the order in which they were taken, and its source: "time" or "name".
 
     Times are used if every photograph has one and most of them differ.
     """
-    times = [photo.taken.seconds for photo in photos]
-    known = [seconds for seconds in times if seconds is not None]
-    if len(known) < len(photos) or 2 * len(set(known)) < len(photos):
+    times = [photo.metadata.seconds for photo in photos if photo.metadata.seconds is not None]
+    if len(times) < len(photos) or 2 * len(set(times)) < len(photos):
         return list(range(len(photos))), "name"
-    return sorted(range(len(photos)), key=lambda i: (known[i], i)), "time"
+    return sorted(range(len(photos)), key=lambda i: (times[i], i)), "time"
 
 
 def _by(size: tuple[int, int]) -> str:

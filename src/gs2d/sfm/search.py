@@ -26,26 +26,26 @@ FISHEYES = "fisheyes"  # step of the mapping, before images are placed
 CALIBRATED_ANEW = "calibrated anew"  # step of the mapping: pairs are verified again with other cameras
 
 
-def is_of(work: Path, layer: str, wanted: Any) -> bool:
-    """Whether a layer of the interrupted search has the inputs ``wanted``."""
-    return bool(_read(work).get(layer) == _plain(wanted))
+def is_of(work: Path, layer: str, inputs: Any) -> bool:
+    """Whether a layer of the interrupted search has these inputs."""
+    return bool(_read(work).get(layer) == _plain(inputs))
 
 
-def go_on(work: Path, wanted: Mapping[str, Any], *, ours: Sequence[str]) -> str:
+def go_on(work: Path, inputs: Mapping[str, Any], *, ours: Sequence[str]) -> str:
     """Keep the layers of an earlier search whose inputs are equal, remove the others, and store the new inputs.
 
-    Returns one line about what is kept; empty without an earlier search. ``wanted``: inputs of each of ``LAYERS``.
+    Returns one line about what is kept; empty without an earlier search. ``inputs``: inputs of each of ``LAYERS``.
     ``ours``: folders of the caller that belong to the layer "photographs".
     """
-    before, wanted = _read(work), _plain(wanted)
-    first = next((i for i, layer in enumerate(LAYERS) if before.get(layer) != wanted[layer]), len(LAYERS))
+    before, inputs = _read(work), _plain(inputs)
+    first = next((i for i, layer in enumerate(LAYERS) if before.get(layer) != inputs[layer]), len(LAYERS))
     if first < len(LAYERS) and (work / MAPPING / f"{CALIBRATED_ANEW}.json").exists():
         first = min(first, LAYERS.index("pairs"))
-    kept = _kept(work, first) if before and first else ""
+    note = _retained_note(work, first) if before and first else ""
     for layer in reversed(LAYERS[first:]):  # the last layer first, so that an interruption leaves complete layers
         _remove(work, layer, ours)
-    write_json(work / SEARCH, {layer: wanted[layer] for layer in LAYERS})
-    return kept
+    write_json(work / SEARCH, {layer: inputs[layer] for layer in LAYERS})
+    return note
 
 
 def forget(work: Path) -> None:
@@ -95,7 +95,7 @@ def _clear(database: Path) -> None:
             path.unlink()
 
 
-def _kept(work: Path, layers: int) -> str:
+def _retained_note(work: Path, layers: int) -> str:
     """Describe what exists of the first ``layers`` layers."""
     parts = []
     with contextlib.suppress(*DAMAGED), contextlib.closing(read_only(work / DATABASE)) as connection:

@@ -108,8 +108,8 @@ def take(video: Video, numbers: Sequence[int], folder: Path) -> list[Path]:
     Raises DataError if ffmpeg fails or writes fewer frames.
     """
     folder.mkdir(parents=True)
-    wanted = "+".join(f"eq(n,{number})" for number in numbers)
-    filters = f"select='{wanted}',setpts=N/({_RATE}*TB)"
+    selection = "+".join(f"eq(n,{number})" for number in numbers)
+    filters = f"select='{selection}',setpts=N/({_RATE}*TB)"
     options = ["-vf", filters, "-r", str(_RATE), "-q:v", str(QUALITY), "-start_number", "0", "%06d.jpg"]
     with _decoding(video, options, into=folder) as stream:
         stream.read()

@@ -25,12 +25,12 @@ OLD = "old"  # an earlier capture, until it is replaced
 _FILES = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
 
 
-def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
-    """Raise RunError or DiskError if the capture cannot or must not be written to ``given``."""
-    out, photos = given.resolve(), images.resolve()
+def check_out(path: Path, images: Path, *, overwrite: bool) -> None:
+    """Raise RunError or DiskError if the capture cannot or must not be written to ``path``."""
+    out, photos = path.resolve(), images.resolve()
     if out == photos or photos in out.parents or out in photos.parents:
         raise RunError(
-            f"--out {given} must not be inside or above the folder of the photographs ({images}), which is only read; "
+            f"--out {path} must not be inside or above the folder of the photographs ({images}), which is only read; "
             "choose a folder beside it"
         )
     try:
@@ -38,22 +38,22 @@ def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
     except FileNotFoundError:
         return
     except NotADirectoryError as error:
-        raise RunError(f"--out must be a folder, {given} is a file or lies below one") from error
+        raise RunError(f"--out must be a folder, {path} is a file or lies below one") from error
     except OSError as error:
         raise disk_error(out, error) from error
     if out.is_mount():
-        raise RunError(f"--out {given} is a mount point, which cannot be renamed; choose a folder in it")
+        raise RunError(f"--out {path} is a mount point, which cannot be renamed; choose a folder in it")
     others = sorted(entries - set(_FILES) - ({MASKS} if _has_own_masks(out) else set()))
     if POSES_JSON in entries and not others:
         if not overwrite:
-            raise RunError(f"{given} already holds a capture; replace it with --overwrite")
+            raise RunError(f"{path} already holds a capture; replace it with --overwrite")
     elif entries:
         raise RunError(
-            f"--out must be new, empty or a capture of this command; {given} holds other files "
+            f"--out must be new, empty or a capture of this command; {path} holds other files "
             f"({(others or sorted(entries))[0]}); choose another folder"
         )
     if out == Path.cwd() or out in Path.cwd().parents:
-        raise RunError(f"--out {given} is the current folder and would be replaced; run the command from elsewhere")
+        raise RunError(f"--out {path} is the current folder and would be replaced; run the command from elsewhere")
 
 
 def _has_own_masks(out: Path) -> bool:
@@ -77,10 +77,10 @@ def workspace(out: Path) -> Iterator[Path]:
     the same capture.
     """
     work = hidden_workspace(out)
-    made = make_folder(work)
-    with contextlib.ExitStack() as held:
+    created = make_folder(work)
+    with contextlib.ExitStack() as stack:
         try:
-            held.enter_context(RunFolder(work).locked())
+            stack.enter_context(RunFolder(work).locked())
         except RunError as error:
             raise RunError(f"{out} is being created by another process; wait for it or choose another --out") from error
         try:
@@ -92,7 +92,7 @@ def workspace(out: Path) -> Iterator[Path]:
         finally:
             if not (work / SEARCH).exists():
                 shutil.rmtree(work, ignore_errors=True)
-    remove_made(made)  # on systems where an open lock file cannot be deleted
+    remove_made(created)  # on systems where an open lock file cannot be deleted
 
 
 def sweep_workspace(out: Path) -> None:

@@ -27,11 +27,11 @@ from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.prepare.limits import MAX_THREADS
 from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_choices, values
-from gs2d.sfm.colmap_process import Request, check_installed, layers, read_facts, solve
+from gs2d.sfm.colmap_process import Request, check_installed, layers, read_match_counts, solve
 from gs2d.sfm.copies import copy_images, copy_masks, masks_of
 from gs2d.sfm.lens import FISHEYE, PANORAMA, START
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed, write_image_of
-from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, in_order_taken, panorama_groups, read_photos
+from gs2d.sfm.photos import FEWEST, Photo, camera_groups, chronological_order, find_photos, panorama_groups, read_photos
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
 from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
 from gs2d.sfm.workspace import (
@@ -245,7 +245,7 @@ def _request(
         on_event(Notice(line))
     # Fisheyes are set later: COLMAP verifies no pair of fisheyes with unknown focal length.
     lens = START if options.camera_model in ("auto", FISHEYE) else options.camera_model
-    order, ordered_by = in_order_taken(photos)
+    order, ordered_by = chronological_order(photos)
     located = sum(position is not None for position in positions)
     return {  # every path is absolute
         "images": str(work / STAGED / IMAGES),
@@ -280,7 +280,7 @@ def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list
     """
     labels = [photo.label for photo in photos]
     if listed is None:
-        located = {photo.label: np.array(photo.taken.place) for photo in photos if photo.taken.place is not None}
+        located = {photo.label: np.array(photo.metadata.place) for photo in photos if photo.metadata.place is not None}
         positions = Positions(located, None, "GPS in EXIF", in_degrees=True)
     else:
         positions = read_positions(listed)
@@ -344,7 +344,7 @@ def _read_models(
     Raises DataError if no photograph was placed.
     """
     models = [read_model(Path(request["output"]) / str(i), done) for i, done in enumerate(solved["models"])]
-    stats = read_facts(Path(request["database"]))
+    stats = read_match_counts(Path(request["database"]))
     check_any(models, stats, options.photos)
     best = models[0]
     per_camera = Counter(image.camera_id for image in best.images)

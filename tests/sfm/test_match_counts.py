@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gs2d.errors import DataError
-from gs2d.sfm.colmap_process import read_facts
+from gs2d.sfm.colmap_process import read_match_counts
 
 
 @pytest.mark.parametrize("data", [None, b"no database", b""])
@@ -16,4 +16,4 @@ def test_an_unreadable_database_is_a_one_line_error(tmp_path: Path, data: bytes 
     if data is not None:
         (tmp_path / "database.db").write_bytes(data)
     with pytest.raises(DataError, match=r"database\.db"):
-        read_facts(tmp_path / "database.db")
+        read_match_counts(tmp_path / "database.db")
