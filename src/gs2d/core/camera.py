@@ -131,7 +131,7 @@ class Camera:
         Raises
         ------
         ShapeError
-            If nothing is left.
+            If the result is empty.
         """
         width, height = self.width // factor, self.height // factor
         if factor < 1 or width < 1 or height < 1:

@@ -12,7 +12,7 @@ from gs2d.errors import DataError
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Write JSON atomically: UTF-8, two spaces of indent, keys in the given order.
+    """Write JSON atomically: UTF-8, two spaces of indent, keys in the order of the mapping.
 
     Raises DiskError if the file could not be written, ValueError for NaN or infinity, which JSON does not have.
     """

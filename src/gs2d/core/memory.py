@@ -1,4 +1,4 @@
-"""Freed memory: returned to the operating system between phases, kept by the C library within them.
+"""Freed memory: returned to the operating system between phases, retained by the C library within them.
 
 The C library keeps freed memory for later requests. Fragmentation while images are decoded and separate heaps of
 threads can multiply the memory use: 93 MB of images took 549 MB.

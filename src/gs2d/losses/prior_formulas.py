@@ -1,7 +1,7 @@
 """Losses on known depths and normals: plain torch, any dtype and device (docs/math.md, "Priors").
 
 Depth errors are relative, |z / d - 1| for a rendered depth z and a known depth d, so that the scale of the scene does
-not matter. Known values are constant; nothing here waits for a device.
+not matter. The targets are constant; nothing here waits for a device.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class NormalTarget:
     """Unit normals in the world frame."""
 
     directions: Tensor  # [H, W, 3]: 0 where unknown
-    valid: Tensor  # [H, W]: 1 where known, else 0
+    valid: Tensor  # [H, W]: 1 where defined, else 0
 
 
 Depths = PointDepths | MetricDepth | RelativeDepths

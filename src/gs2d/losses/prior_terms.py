@@ -19,14 +19,14 @@ from gs2d.render.types import RenderOutput
 
 
 class _PriorLoss(Loss):
-    """A loss on known values, whose settings are a field of the recipe."""
+    """A loss on depths or normals of the capture, whose settings are a field of the recipe."""
 
     settings: str
     _priors: Priors
     _prior: DepthPrior | NormalPrior
 
     def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
-        """Plan how known values are read; raise DataError if the capture has none of the requested kind."""
+        """Plan how the depths or normals are read; raise DataError if the capture has none of the requested kind."""
         self._prior = getattr(recipe, self.settings)
         others: dict[str, Any] = {name: None for name in SETTINGS if name != self.settings}
         self._priors = Priors(scene, replace(recipe, **others), device=device)

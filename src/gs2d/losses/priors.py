@@ -76,7 +76,7 @@ def _sampled_views(mapped: list[View]) -> list[View]:
 def _fitted_unit(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> float | None:
     """Return the unit that fits the maps to the points; None without points.
 
-    Raise DataError if too few points lie on known pixels.
+    Raise DataError if too few points lie on pixels with a depth.
     """
     if observed is None:
         return None
@@ -109,7 +109,7 @@ def _fitted_space(mapped: list[View], observed: ObservedPoints | None, settings:
 
 
 def _pairs(view: View, observed: ObservedPoints, settings: DepthPrior) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depths [M] of points of a view on known pixels of its map, and the values of the map there."""
+    """Return the depths [M] of points of a view on valid pixels of its map, and the values of the map there."""
     assert view.maps is not None
     return _values_at(points_in(view, observed, settings), view.maps.depth())
 

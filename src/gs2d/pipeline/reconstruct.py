@@ -150,7 +150,7 @@ def _claimed(out: Path) -> Iterator[None]:
 
 
 def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
-    """Return the contents of ``poses.json``; raise RunError if other photographs or options made it."""
+    """Return the contents of ``poses.json``; raise RunError if it has other photographs or options."""
     poses, requested = read_json(capture / POSES_JSON), requested_options(poses_options(options))
     try:
         stored = {"photos": poses["photos"], **poses["requested"]}

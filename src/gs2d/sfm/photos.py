@@ -246,7 +246,7 @@ def _not_whole(photo: Photo, why: str) -> DataError:
 
 
 def chronological_order(photos: Sequence[Photo]) -> tuple[list[int], str]:
-    """Return the indices of the photographs in the order in which they were taken, and its source: "time" or "name".
+    """Return the indices of the photographs in chronological order, and the source of the order: "time" or "name".
 
     Times are used if every photograph has one and most of them differ.
     """

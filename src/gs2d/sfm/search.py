@@ -34,7 +34,7 @@ def is_of(work: Path, layer: str, inputs: Any) -> bool:
 def go_on(work: Path, inputs: Mapping[str, Any], *, ours: Sequence[str]) -> str:
     """Keep the layers of an earlier search whose inputs are equal, remove the others, and store the new inputs.
 
-    Returns one line about what is kept; empty without an earlier search. ``inputs``: inputs of each of ``LAYERS``.
+    Returns one line about the layers kept; empty without an earlier search. ``inputs``: inputs of each of ``LAYERS``.
     ``ours``: folders of the caller that belong to the layer "photographs".
     """
     before, inputs = _read(work), _plain(inputs)
@@ -49,7 +49,7 @@ def go_on(work: Path, inputs: Mapping[str, Any], *, ours: Sequence[str]) -> str:
 
 
 def forget(work: Path) -> None:
-    """End a search: nothing of it is kept."""
+    """End a search and discard its layers."""
     (work / SEARCH).unlink(missing_ok=True)
 
 

@@ -98,7 +98,7 @@ def workspace(out: Path) -> Iterator[Path]:
 def sweep_workspace(out: Path) -> None:
     """Remove the workspace of a finished capture, left by a command that was killed while removing it.
 
-    A locked workspace is kept, and so is one with an unfinished search.
+    A locked workspace remains, and so does one with an unfinished search.
     """
     work = hidden_workspace(out)
     done = (out / POSES_JSON).exists() and not ((work / SEARCH).exists() and (work / STAGED).exists())

@@ -17,7 +17,7 @@ from gs2d.render.backends import Backend
 
 TARGET_BYTES = 1 << 28  # of float targets: enough for all images of a small capture
 DEVICE_BYTES = 1 << 31  # of images on a GPU
-# Fraction of the images that must fit, or none is kept: making a target from decoded bytes takes only a few ms.
+# Fraction of the images that must fit, or none is cached: making a target from decoded bytes takes only a few ms.
 WORTH_KEEPING = 0.5
 PINNED_BYTES = 1 << 33
 
@@ -93,10 +93,10 @@ def make_targets(
 
 
 class Targets:
-    """Targets as float tensors. The first ones that fit in ``limit_bytes`` are kept, unless they are few.
+    """Targets as float tensors. The first ones that fit in ``limit_bytes`` are cached, unless they are few.
 
     Nothing is evicted: views come in shuffled epochs, so the least recently used one is needed next. ``background`` is
-    in [0, 1]. ``mean``: computes the local mean of an image, which is kept with it. ``needs``: "silhouette" and
+    in [0, 1]. ``mean``: computes the local mean of an image, which is cached with it. ``needs``: "silhouette" and
     "flatness", if they are needed.
     """
 
@@ -204,7 +204,7 @@ class DeviceTargets:
         return self._buffers[key].copy_(tensor, non_blocking=True)
 
     def _decoded(self, index: int) -> ImageBytes:
-        """Return an image that is kept, or decode it and keep it if there is room."""
+        """Return a cached image, or decode it and cache it if there is room."""
         if index in self._cached:
             return self._cached[index]
         view = self._views[index]

@@ -1,4 +1,4 @@
-"""The subject of a run: found from rendered depth and sparse points, reported, and written into the run."""
+"""The subject of a run: detected in rendered depth and sparse points, reported, and written into the run."""
 
 from __future__ import annotations
 

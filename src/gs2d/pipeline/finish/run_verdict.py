@@ -67,7 +67,7 @@ class Measures:
     """The input of a verdict."""
 
     views: tuple[ViewMeasures, ...]
-    placed: int | None = None  # photographs with a camera, if `gs2d poses` made the capture
+    placed: int | None = None  # photographs with a camera, if `gs2d poses` created the capture
     count: int | None = None  # all photographs, in that case
     lost: tuple[str, ...] = ()  # names of the photographs without a camera
 

@@ -111,11 +111,11 @@ class Viewpoints:
 
 
 def choose_viewpoints(splats: Splats, settings: RasterSettings, backend: Backend) -> Viewpoints:
-    """Return cameras that show the subject of splats from all sides that can be seen.
+    """Return cameras that show the subject of splats from all visible sides.
 
     The subject is where the splats are densest. Cameras on a sphere around it look at its centre. If cameras in its
     middle see about as much, and surfaces that are hidden from outside, it is a room, and cameras in its middle look
-    outwards. A surface that is visible from both sides is an open sheet (a floor, a facade); it is seen from the side
+    outwards. A surface that is visible from both sides is an open sheet (a floor, a facade); it is shown from the side
     that shows more. Raises DataError if no splat is opaque enough to be a surface, or all are in one point.
     """
     solid = splats.rows(torch.sigmoid(splats.opacity_logits) > FAINT)

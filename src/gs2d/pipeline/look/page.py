@@ -204,7 +204,7 @@ def _world_of(run: RunFolder, on_event: OnEvent) -> WorldScale | None:
 
 
 def _subject(folder: Path, on_event: OnEvent) -> Subject | None:
-    """Return the subject of the run, if known; report a damaged file."""
+    """Return the subject of the run, if there is one; report a damaged file."""
     try:
         return read_subject(folder)
     except DataError as error:

@@ -79,7 +79,7 @@ def estimate(
     """Estimate the training of a scene.
 
     ``downscale`` is the factor by which the photographs are smaller than their files, ``start`` the initial number of
-    splats, if known. Raises DataError if the initial splats do not fit into memory.
+    splats, if available. Raises DataError if the initial splats do not fit into memory.
     """
     allowed = memory_budget()
     start = initial_splats(scene, recipe) if start is None else start

@@ -91,7 +91,7 @@ class ResolvedRun:
     scene: CaptureRecord
     downscale: int  # factor by which the photographs are smaller than their files
     raster: RasterSettings
-    backend: Mapping[str, Any]  # what determines its results (`Backend.facts`)
+    backend: Mapping[str, Any]  # settings that determine its results (`Backend.facts`)
     schedule_scale: float = 1.0  # trained fraction of the full schedule
     title: str = ""  # heading of the report; empty: the name of the capture
     init: str | None = None  # hash of the file of initial splats

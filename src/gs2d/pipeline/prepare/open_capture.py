@@ -26,7 +26,7 @@ from gs2d.sfm.workspace import POSES_JSON
 from gs2d.training.events import Event, Notice, OnEvent
 
 SHOWN_SKIPS = 3
-FEW = 24  # photographs found by `gs2d poses`; with fewer, all are needed for the surface
+FEW = 24  # photographs placed by `gs2d poses`; with fewer, all are needed for the surface
 
 
 class QualityLevel(NamedTuple):
@@ -192,7 +192,7 @@ def with_masks(protocol: Protocol, scene: Scene, on_event: OnEvent) -> Protocol:
         return protocol
     if masks.asked_for:
         return replace(protocol, use_mask_in_training=True, use_mask_in_fusion=True)
-    on_event(Notice(f"the protocol {protocol.name} trains on masked pixels too (--masked ignore leaves them out)"))
+    on_event(Notice(f"the protocol {protocol.name} trains on masked pixels too (--masked ignore excludes them)"))
     return protocol
 
 
@@ -231,7 +231,7 @@ def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -
 
 
 def _unmasked_pixels(view: View) -> np.ndarray:
-    """Return the pixels that a mask keeps, [H, W] bool; the border that undistortion leaves counts as kept."""
+    """Return the unmasked pixels, [H, W] bool; the border that undistortion leaves counts as unmasked."""
     usable = np.ones((view.camera.height, view.camera.width), dtype=bool)
     mask, valid, alpha = view.mask(), view.valid(), view.alpha()
     if mask is not None:

@@ -1,6 +1,6 @@
 """``gs2d poses``: photographs become a capture, completely or not at all.
 
-The capture is made in a workspace (``sfm.workspace``), read back by the loader that training uses, and then moved.
+The capture is created in a workspace (``sfm.workspace``), read back by the loader that training uses, and then moved.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def _request(
             }
             for group, is_panorama in zip(groups, panoramas, strict=True)
         ],
-        "in_order": [photos[i].name for i in order],  # in which they were taken
+        "in_order": [photos[i].name for i in order],  # chronological
         "ordered_by": ordered_by,  # "time" or "name"
         "places": [positions[i] for i in order],  # metres; None: unknown
         "matching": _matching(options.matching, len(photos), located),
@@ -275,7 +275,7 @@ def _request(
 def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list[Position | None], str]:
     """Return the position of each photograph in a local frame, from a list or from EXIF, and a note.
 
-    Unknown positions are None. Heights are 0 unless all are known. Raises DataError if the list cannot be read, or
+    Unknown positions are None. Heights are 0 unless all are available. Raises DataError if the list cannot be read, or
     names none of the photographs.
     """
     labels = [photo.label for photo in photos]
@@ -310,7 +310,7 @@ def metric_positions(photos: Sequence[Photo], listed: Path | None) -> tuple[list
 
 
 def _matching(requested: str, count: int, located: int) -> str:
-    """Return how pairs are chosen for ``count`` photographs, of which ``known`` have positions."""
+    """Return how pairs are chosen for ``count`` photographs, of which ``located`` have positions."""
     if requested == "spatial" and not located:
         raise DataError(
             f"--matching spatial needs photographs with positions, got none of {count}; use --positions FILE or "

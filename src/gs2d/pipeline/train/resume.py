@@ -45,7 +45,7 @@ def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> tuple[Train
         run.events.cut(payload["events_bytes"])
         finished = checkpoint.stage_index + (checkpoint.iteration is None)
         metrics, retained = run.metrics(), {"surface": None}
-        if finished == len(loaded.recipe.stages):  # facts of the mesh are still valid
+        if finished == len(loaded.recipe.stages):  # the mesh is still valid
             retained |= {name: metrics[name] for name in ("surface", "mesh") if name in metrics}
         run.write_metrics({"stages": metrics["stages"][:finished], **retained})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))

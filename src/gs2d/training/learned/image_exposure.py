@@ -38,7 +38,7 @@ class ImageExposure(LearnedQuantity):
         self._initial, self._scene = initial, scene
 
     def begin(self, previous: Tensor | None = None) -> Tensor:
-        """Return theta [V, 3, 4]: zeros, gains of sparse points, or given transforms."""
+        """Return theta [V, 3, 4]: zeros, gains of sparse points, or previous transforms."""
         values = super().begin()
         if self._initial == "given":
             if previous is None or len(previous) != len(values):

@@ -17,7 +17,7 @@ from gs2d.config.quantities import Quantity
 from gs2d.core.camera import Camera
 from gs2d.data.scene import Scene, View
 
-MOST_CURVES = 6  # more lines in one plot cannot be told apart
+MOST_CURVES = 6  # more lines in one plot are indistinguishable
 
 
 @dataclass
