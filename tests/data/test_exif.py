@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import ExifTags, Image
 
-from gs2d.data.exif import Taken, read_taken
+from gs2d.data.exif import Metadata, read_metadata
 
 
 def write(path: Path, *, gps: dict[int, object] | None = None, time: str = "", part: str = "") -> Path:
@@ -34,17 +34,17 @@ def gps(latitude: float, longitude: float, *, height: float | None = None) -> di
 
 
 def test_the_position_has_signs_and_an_optional_height(tmp_path: Path) -> None:
-    assert read_taken(write(tmp_path / "a.jpg", gps=gps(-46.5, 91.25, height=-1.5))).place == (-46.5, 91.25, -1.5)
-    latitude, longitude, height = read_taken(write(tmp_path / "b.jpg", gps=gps(46.5, -91.25))).place or (0, 0, 0)
+    assert read_metadata(write(tmp_path / "a.jpg", gps=gps(-46.5, 91.25, height=-1.5))).place == (-46.5, 91.25, -1.5)
+    latitude, longitude, height = read_metadata(write(tmp_path / "b.jpg", gps=gps(46.5, -91.25))).place or (0, 0, 0)
     assert (latitude, longitude) == (46.5, -91.25)
     assert math.isnan(height)
 
 
 @pytest.mark.parametrize("place", [None, gps(141.0, 8.0), gps(0.0, 0.0)], ids=["none", "no latitude", "no fix"])
 def test_an_invalid_position_is_ignored(tmp_path: Path, place: dict[int, object] | None) -> None:
-    assert read_taken(write(tmp_path / "a.jpg", gps=place)).place is None
+    assert read_metadata(write(tmp_path / "a.jpg", gps=place)).place is None
 
 
 @pytest.mark.parametrize("time", ["0000:00:00 00:00:00", "yesterday", "2026:13:01 10:00:59"])
 def test_the_time_of_an_unset_clock_is_ignored(tmp_path: Path, time: str) -> None:
-    assert read_taken(write(tmp_path / "a.jpg", time=time)) == Taken()
+    assert read_metadata(write(tmp_path / "a.jpg", time=time)) == Metadata()

@@ -170,7 +170,7 @@ def test_a_wide_fisheye_is_split_into_faces_and_a_narrow_one_undistorted(tmp_pat
     names = {view.name for view in scene.views if len(observed.in_view(view.name, view.camera, min_track=1).depth)}
     assert names == {f"{index}_front.png" for index in range(9)}  # they look at the point
     assert len(in_front.depth) == int(scene.train[0].name.endswith("front.png"))
-    assert {name for name in observed.seen if "_" in name and len(observed.seen[name])} == names
+    assert {name for name in observed.by_view if "_" in name and len(observed.by_view[name])} == names
     assert scene.observe() is observed
     scene.forget()
     assert scene.observe() is not observed

@@ -180,6 +180,6 @@ def test_points_are_assigned_to_the_images_that_observe_them(tmp_path: Path, kin
     assert observed.error.tolist() == [1.25, 0.5, 24.75]
     assert observed.track.tolist() == [1, 2, 0]  # photographs, not observations; point 7 does not exist
     names = [image[3] for image in model.images]
-    assert sorted(observed.seen[names[0]].tolist()) == [0, 1]
-    assert observed.seen[names[1]].tolist() == [1]
-    assert observed.seen[names[2]].tolist() == []
+    assert sorted(observed.by_view[names[0]].tolist()) == [0, 1]
+    assert observed.by_view[names[1]].tolist() == [1]
+    assert observed.by_view[names[2]].tolist() == []

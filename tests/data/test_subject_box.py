@@ -9,7 +9,7 @@ import pytest
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import write_json
-from gs2d.data.subject_box import Sight, Subject, find_subject, given_subject, middle_weights, read_subject
+from gs2d.data.subject_box import Sight, Subject, find_subject, middle_weights, read_subject, subject_in_box
 from gs2d.errors import DataError
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -92,11 +92,11 @@ def test_a_damaged_subject_is_an_error_with_a_remedy(tmp_path: Path, name: str, 
 
 def test_a_box_of_the_user_is_used_unchanged_or_refused() -> None:
     cameras = around(4, 5.0)
-    subject = given_subject((-1, -2, -3, 1, 2, 3), cameras)
+    subject = subject_in_box((-1, -2, -3, 1, 2, 3), cameras)
     assert (subject.kind, subject.low.tolist(), subject.high.tolist()) == ("object", [-1, -2, -3], [1, 2, 3])
     for box in ((1, 0, 0, 0, 1, 1), (0, 0, 0, 1, 1, np.nan), (0, 0, 1, 1)):
         with pytest.raises(DataError, match="corner"):
-            given_subject(box, cameras)
+            subject_in_box(box, cameras)
 
 
 def test_cameras_that_see_nothing_have_no_subject() -> None:

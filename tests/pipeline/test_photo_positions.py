@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.data.exif import Taken
+from gs2d.data.exif import Metadata
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.pose_finding import _matching, metric_positions
 from gs2d.sfm.photos import Photo
@@ -16,7 +16,7 @@ DEGREE = 111_195.0  # m of latitude, approximately
 
 
 def photo(name: str, place: tuple[float, float, float] | None = None) -> Photo:
-    return Photo(Path(name), name, name, (8, 8), Taken(place=place))
+    return Photo(Path(name), name, name, (8, 8), Metadata(place=place))
 
 
 def line(count: int, step: float, *, without: int = 0) -> list[Photo]:

@@ -113,7 +113,7 @@ def test_the_unit_of_sensor_maps_is_fitted_to_the_points(scene: Scene) -> None:
     assert plan_depths(replace(made, observe=None), DepthPrior()).unit is None
     few = replace(made, train=made.train[:1])
     assert few.observe is not None
-    two = replace(few.observe(), seen={few.train[0].name: np.arange(2)})
+    two = replace(few.observe(), by_view={few.train[0].name: np.arange(2)})
     with pytest.raises(DataError, match="--set"):
         plan_depths(replace(few, observe=lambda: two), DepthPrior("sensor"))
 

@@ -27,20 +27,20 @@ def read_npy(path: str | os.PathLike[str], what: str) -> np.ndarray:
         return _array(file, name)
 
 
-def read_npz(path: str | os.PathLike[str], what: str, wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
-    """Read the arrays of a ``.npz`` archive whose names satisfy ``wanted``.
+def read_npz(path: str | os.PathLike[str], what: str, include: Callable[[str], bool]) -> dict[str, np.ndarray]:
+    """Read the arrays of a ``.npz`` archive whose names satisfy ``include``.
 
     Raises DataError if the file is missing, damaged, or implausibly large when unpacked.
     """
     name = f"{what} {os.fspath(path)}"
     with _one_line(name, "npz"), zipfile.ZipFile(path) as archive:
-        entries = [e for e in check_entries(path, archive.infolist()) if wanted(e.filename.removesuffix(".npy"))]
+        entries = [e for e in check_entries(path, archive.infolist()) if include(e.filename.removesuffix(".npy"))]
         check_growth(path, Path(path).stat().st_size, sum(entry.file_size for entry in entries), "an archive")
-        found = {}
+        arrays = {}
         for entry in entries:
             with archive.open(entry) as file:
-                found[entry.filename.removesuffix(".npy")] = _array(file, f"{name}: {entry.filename}")
-        return found
+                arrays[entry.filename.removesuffix(".npy")] = _array(file, f"{name}: {entry.filename}")
+        return arrays
 
 
 def _array(file: IO[bytes], name: str) -> np.ndarray:

@@ -32,7 +32,7 @@ def scene_bounds(
             return np.stack([low - margin, high + margin]), ()
     if is_synthetic and _fits_blender_box(cameras):
         return np.array([[-_BLENDER_HALF] * 3, [_BLENDER_HALF] * 3]), ()
-    box = _box_seen_by_most(cameras)
+    box = _commonly_visible_box(cameras)
     if box is not None:
         return box, ()
     return _box_ahead(cameras), (
@@ -62,7 +62,7 @@ def _axes_meet(cameras: Sequence[Camera]) -> bool:
     return bool(spread > np.sin(np.radians(3.0)) ** 2 and ahead > 0.5)
 
 
-def _box_seen_by_most(cameras: Sequence[Camera]) -> np.ndarray | None:
+def _commonly_visible_box(cameras: Sequence[Camera]) -> np.ndarray | None:
     """Return the box of the grid points that at least 80 % of the maximum number of cameras see."""
     if len(cameras) < 2 or not _axes_meet(cameras):
         return None
@@ -71,15 +71,15 @@ def _box_seen_by_most(cameras: Sequence[Camera]) -> np.ndarray | None:
     reach = np.median(np.linalg.norm(centers - focus, axis=1))
     ticks = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
     grid = focus + reach * np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    seen = np.zeros(len(grid))
+    votes = np.zeros(len(grid))
     chosen_cameras = np.linspace(0, len(cameras) - 1, min(len(cameras), _CAMERAS)).round().astype(int)
     for camera in (cameras[index] for index in chosen_cameras):
         pixels, depth = camera.project(grid)
         inside = (pixels >= 0).all(axis=1) & (pixels <= (camera.width, camera.height)).all(axis=1)
-        seen += inside & (depth > 0.05 * reach)
-    if seen.max() < 2:
+        votes += inside & (depth > 0.05 * reach)
+    if votes.max() < 2:
         return None
-    chosen = grid[seen >= 0.8 * seen.max()]
+    chosen = grid[votes >= 0.8 * votes.max()]
     half_cell = reach / _GRID
     return np.stack([chosen.min(axis=0) - half_cell, chosen.max(axis=0) + half_cell])
 
@@ -108,7 +108,7 @@ class Reach:
     center: np.ndarray  # [3] world units; mean of the training cameras
     radius: float  # world units
 
-    def holds(self, points: np.ndarray) -> np.ndarray:
+    def contains(self, points: np.ndarray) -> np.ndarray:
         """Return which points [P, 3] are inside, [P] bool."""
         return np.asarray(np.linalg.norm(points - self.center, axis=1) <= self.radius)
 
@@ -119,8 +119,8 @@ def reach_of(scene: Scene, further: np.ndarray | None = None) -> Reach | None:
     ``further`` [P, 3] world units: points beside the sparse points.
     """
     center = np.stack([view.camera.center for view in scene.train]).mean(axis=0)
-    known = [array for array in (None if scene.points is None else scene.points.points, further) if array is not None]
-    points = np.concatenate([np.zeros((0, 3)), *known])
+    clouds = [array for array in (None if scene.points is None else scene.points.points, further) if array is not None]
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         return None

@@ -167,13 +167,13 @@ def fit_to_file(frame: PosedImage) -> PosedImage:
     return replace(frame, intrinsics=k)
 
 
-def _check_aspect(what: str, got: tuple[int, int], expected: tuple[int, int], owner: str) -> None:
-    sx, sy = got[0] / expected[0], got[1] / expected[1]
+def _check_aspect(what: str, size: tuple[int, int], expected: tuple[int, int], owner: str) -> None:
+    sx, sy = size[0] / expected[0], size[1] / expected[1]
     # Allow one pixel of rounding on either axis.
-    if abs(sx / sy - 1) > max(_ASPECT_TOLERANCE, 1 / min(got), 1 / min(expected)):
+    if abs(sx / sy - 1) > max(_ASPECT_TOLERANCE, 1 / min(size), 1 / min(expected)):
         raise DataError(
             f"{what} must have the size or aspect ratio of its {owner}, {expected[0]}x{expected[1]}, "
-            f"got {got[0]}x{got[1]}; was it rotated or cropped after calibration?"
+            f"got {size[0]}x{size[1]}; was it rotated or cropped after calibration?"
         )
 
 
@@ -291,61 +291,61 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache) -> View:
             f"view {frame.name}: expected a focal length of {_LENSES[0]:g} to {_LENSES[1]:g} times the image side, "
             f"got {k.fx:.4g}, {k.fy:.4g} px for {k.width}x{k.height} px; is it in pixels?"
         )
-    seen = k if frame.face is None else frame.face.intrinsics
+    ideal = k if frame.face is None else frame.face.intrinsics
     try:
-        camera = Camera(seen.width, seen.height, seen.fx, seen.fy, seen.cx, seen.cy, frame.T_cam_world)
+        camera = Camera(ideal.width, ideal.height, ideal.fx, ideal.fy, ideal.cx, ideal.cy, frame.T_cam_world)
         camera = camera.downscaled(factor)
     except ShapeError as error:
         raise DataError(f"view {frame.name}: {error}") from error
     maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera)
     is_face = frame.face is not None
     read = functools.partial(decode, frame, factor)
-    return View(frame.name, camera, read, cache, frame.path, maps, seen, is_face=is_face)
+    return View(frame.name, camera, read, cache, frame.path, maps, ideal, is_face=is_face)
 
 
 def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...]]:
     """Split panoramas and wide fisheyes into pinhole faces; returns the frames and a note."""
     faces = {k: faces_of(k) for k in dict.fromkeys(frame.intrinsics for frame in frames)}
-    found: list[PosedImage] = []
+    split_frames: list[PosedImage] = []
     kinds: dict[str, int] = {}
     shown: dict[Any, bool] = {}
     for frame in frames:
         lens, parts = frame.intrinsics.lens, faces[frame.intrinsics]
         if lens is None or not parts:
-            found.append(frame)
+            split_frames.append(frame)
             continue
         kinds[lens.kind] = kinds.get(lens.kind, 0) + 1
         for face in parts:
-            if not _mask_leaves(frame, face, shown):
+            if not _shows_enough(frame, face, shown):
                 continue
             T = frame.T_cam_world.copy()
             T[:3] = face.rotation @ T[:3]
-            found.append(replace(frame, name=face_name(frame.name, face), T_cam_world=T, face=face, maps=None))
+            split_frames.append(replace(frame, name=face_name(frame.name, face), T_cam_world=T, face=face, maps=None))
     if not kinds:
         return list(frames), ()
     what = " and ".join(f"{count} {kind} photographs" for kind, count in kinds.items())
-    number = sum(frame.face is not None for frame in found)
+    number = sum(frame.face is not None for frame in split_frames)
     maps = any(frame.maps is not None for frame in frames)
     note = f"{what} are cut into {number} pinhole faces of 90 degrees, so that nothing is lost"
-    return found, (note + ("; their depth and normal maps are not used" if maps else ""),)
+    return split_frames, (note + ("; their depth and normal maps are not used" if maps else ""),)
 
 
-def _mask_leaves(frame: PosedImage, face: Face, known: dict[Any, bool]) -> bool:
+def _shows_enough(frame: PosedImage, face: Face, cache: dict[Any, bool]) -> bool:
     """Whether the mask of a fisheye leaves enough of a face.
 
-    ``known`` caches results: the images of a camera mostly share one mask.
+    ``cache`` holds earlier results: the images of a camera mostly share one mask.
     """
     k = frame.intrinsics
     if frame.mask is None or frame.mask_is_alpha or k.lens is None or model_of(k.lens).wraps:
         return True
     key = (k, face.name, hashlib.sha256(frame.mask.read_bytes()).digest())
-    if key not in known:
+    if key not in cache:
         mask = read_mask(frame.mask)
         positions, valid = face_positions(k, replace(face, side=GLANCE))
         u, v = (positions * (mask.shape[1] / k.width, mask.shape[0] / k.height)).astype(int).reshape(-1, 2).T
-        left = valid & mask[v.clip(max=len(mask) - 1), u.clip(max=mask.shape[1] - 1)].reshape(valid.shape)
-        known[key] = bool(left.mean() >= LEAST_SHOWN)
-    return known[key]
+        visible = valid & mask[v.clip(max=len(mask) - 1), u.clip(max=mask.shape[1] - 1)].reshape(valid.shape)
+        cache[key] = bool(visible.mean() >= LEAST_SHOWN)
+    return cache[key]
 
 
 def _observed(
@@ -361,20 +361,20 @@ def _observed(
     parts = [frame for frame in frames if frame.face is not None]
 
     def read() -> ObservedPoints:
-        found, why = None, UNOBSERVED
+        observed, why = None, UNOBSERVED
         if capture.observe is not None:
             try:
-                found = capture.observe()
+                observed = capture.observe()
             except DataError as error:
                 why = str(error)
-        if found is None or not any(map(len, found.seen.values())):
+        if observed is None or not any(map(len, observed.by_view.values())):
             return ObservedPoints.projected(None if points is None else points.points, cameras, why)
-        seen = dict(found.seen)
+        by_view = dict(observed.by_view)
         for part in parts:
-            if (rows := found.seen.get(wholes[part.path])) is not None:
-                x, y, z = part.T_cam_world[:3, :3] @ found.points[rows].T + part.T_cam_world[:3, 3:]
-                seen[part.name] = rows[np.maximum(abs(x), abs(y)) < z]
-        return replace(found, seen=seen)
+            if (rows := observed.by_view.get(wholes[part.path])) is not None:
+                x, y, z = part.T_cam_world[:3, :3] @ observed.points[rows].T + part.T_cam_world[:3, 3:]
+                by_view[part.name] = rows[np.maximum(abs(x), abs(y)) < z]
+        return replace(observed, by_view=by_view)
 
     return functools.cache(read)  # called for every view
 
@@ -390,10 +390,10 @@ def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedI
         return frames, (note,) if masks.masked is not None else (), masks
     homes = [home for home in (capture.home, *capture.mask_homes, root) if home is not None]
     named, names, images = ([getattr(frame, what) for frame in frames] for what in ("mask", "name", "path"))
-    found, note = find_masks(names, images, named, homes, masks)
-    count = len(found) - found.count(None)
+    paths, note = find_masks(names, images, named, homes, masks)
+    count = len(paths) - paths.count(None)
     empty = masks.masked == EMPTY and count > 0
-    frames = [replace(frame, mask=mask, mask_is_alpha=empty) for frame, mask in zip(frames, found, strict=True)]
+    frames = [replace(frame, mask=mask, mask_is_alpha=empty) for frame, mask in zip(frames, paths, strict=True)]
     return frames, (note,) if note else (), replace(masks, found=count)
 
 
@@ -430,8 +430,8 @@ def _split(
         numbers = {whole: number for number, whole in enumerate(dict.fromkeys(wholes))}  # faces stay together
         is_test = [bool(every) and numbers[whole] % every == 0 for whole in wholes]
     train, test = (  # outliers do not change the other test views
-        tuple(view for i, view in enumerate(views) if is_test[i] == wanted and i not in outliers)
-        for wanted in (False, True)
+        tuple(view for i, view in enumerate(views) if is_test[i] == held_out and i not in outliers)
+        for held_out in (False, True)
     )
     if not train:
         raise DataError(f"{root} must have a training view, got only {len(test)} test views; use test_every=0")

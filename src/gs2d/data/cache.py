@@ -46,11 +46,11 @@ class DecodedImage:
         """
         if factor == 1:
             return self
-        mask, known = (
+        mask, valid = (
             None if pixels is None else mask_downscale(pixels, factor, need=1.0) for pixels in (self.mask, self.valid)
         )
         object_mask = None if self.object_mask is None else mask_downscale(self.object_mask, factor, need=0.5)
-        return DecodedImage(area_downscale(self.image, factor), mask, object_mask, known)
+        return DecodedImage(area_downscale(self.image, factor), mask, object_mask, valid)
 
     @property
     def nbytes(self) -> int:
@@ -94,10 +94,10 @@ class ImageCache:
     def get(self, key: Hashable, decode: Callable[[], DecodedImage]) -> DecodedImage:
         """Return the image of ``key``, decoded if it is not in the cache."""
         with self._lock:
-            held = self._images.get(key)
-            if held is not None:
+            cached = self._images.get(key)
+            if cached is not None:
                 self._images.move_to_end(key)
-                return held
+                return cached
             if self._file is not None and key in self._places:
                 return self._keep(key, DecodedImage(*self._file.get(self._places[key])))
         image = decode()
@@ -143,14 +143,14 @@ class ReadAhead:
     def __init__(self, load: Callable[[int], object]) -> None:
         self._load = load
         self._pool = ThreadPoolExecutor(2, thread_name_prefix="read-ahead")
-        self._asked: set[int] = set()
+        self._requested: set[int] = set()
 
     def expect(self, indices: Sequence[int]) -> None:
         """Request the images of indices that were not in the previous call."""
         for index in indices:
-            if index not in self._asked:
+            if index not in self._requested:
                 self._pool.submit(self._quietly, index)
-        self._asked = set(indices)
+        self._requested = set(indices)
 
     def _quietly(self, index: int) -> None:
         with contextlib.suppress(Exception):

@@ -1,4 +1,4 @@
-"""EXIF metadata of an image: position, time, orientation and camera; XMP tells panoramas.
+"""EXIF metadata of an image: position, time, orientation and camera; XMP marks panoramas.
 
 Damaged metadata is ignored.
 """
@@ -28,18 +28,18 @@ _ORIENTATIONS = range(1, 9)
 
 
 @dataclass(frozen=True)
-class Taken:
-    """How a photograph was taken."""
+class Metadata:
+    """Metadata of a photograph."""
 
     orientation: int = _UPRIGHT  # EXIF, 1 (upright) to 8
-    made_by: tuple[str, ...] = ("",) * 5  # make, model, lens and focal lengths as in EXIF; empty strings if missing
+    camera_tags: tuple[str, ...] = ("",) * 5  # make, model, lens and focal lengths as in EXIF; empty strings if missing
     # Latitude and longitude (degrees, WGS 84) and height (m); a missing height is NaN.
     place: tuple[float, float, float] | None = None
     seconds: float | None = None  # time of the camera clock, without time zone
     panorama: str = ""  # "whole" or "part" of an equirectangular 360-degree panorama (XMP GPano), or empty
 
 
-def read_taken(path: Path) -> Taken:
+def read_metadata(path: Path) -> Metadata:
     """Read the metadata of an image; defaults if it is damaged."""
     base = ExifTags.Base
     try:
@@ -49,11 +49,11 @@ def read_taken(path: Path) -> Taken:
             orientation = exif.get(base.Orientation, _UPRIGHT)
             tags = [exif.get(base.Make), exif.get(base.Model)]
             tags += [details.get(tag) for tag in (base.LensModel, base.FocalLength, base.FocalLengthIn35mmFilm)]
-            made_by = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
+            camera_tags = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
             place, seconds, panorama = _place(exif), _seconds(exif, details), _panorama(xmp)
     except DAMAGED_EXIF:
-        return Taken()
-    return Taken(orientation if orientation in _ORIENTATIONS else _UPRIGHT, made_by, place, seconds, panorama)
+        return Metadata()
+    return Metadata(orientation if orientation in _ORIENTATIONS else _UPRIGHT, camera_tags, place, seconds, panorama)
 
 
 def _xmp(file: Image.Image) -> str:
@@ -64,10 +64,10 @@ def _xmp(file: Image.Image) -> str:
 
 def _panorama(xmp: str) -> str:
     """Return "whole", "part" or "" by Google's Photo Sphere XMP, as 360-degree cameras and stitchers write it."""
-    if _found(xmp, "ProjectionType").lower() != "equirectangular":
+    if _xmp_value(xmp, "ProjectionType").lower() != "equirectangular":
         return ""
     sides = [
-        (_found(xmp, f"CroppedAreaImage{side}Pixels"), _found(xmp, f"FullPano{side}Pixels"))
+        (_xmp_value(xmp, f"CroppedAreaImage{side}Pixels"), _xmp_value(xmp, f"FullPano{side}Pixels"))
         for side in ("Width", "Height")
     ]
     return "part" if any(shown != whole for shown, whole in sides if shown and whole) else "whole"
@@ -85,7 +85,7 @@ def _place(exif: Image.Exif) -> tuple[float, float, float] | None:
             height = -height
     except DAMAGED_EXIF:
         return None
-    return _believable(latitude, longitude, height)
+    return _valid_position(latitude, longitude, height)
 
 
 def _degrees(parts: Sequence[Any], side: Any, negative: str) -> float:
@@ -95,13 +95,13 @@ def _degrees(parts: Sequence[Any], side: Any, negative: str) -> float:
     return -value if letter.strip("\0 ").upper() == negative else value
 
 
-def _found(xmp: str, name: str) -> str:
+def _xmp_value(xmp: str, name: str) -> str:
     """Return the value of a name with any prefix in XMP, as attribute or element; "" without it."""
-    found = re.search(rf"[\w-]+:{name}\s*(?:=\s*[\"']([^\"'<>]*)[\"']|>([^<]*)<)", xmp)
-    return (found[1] or found[2] or "").strip() if found else ""
+    match = re.search(rf"[\w-]+:{name}\s*(?:=\s*[\"']([^\"'<>]*)[\"']|>([^<]*)<)", xmp)
+    return (match[1] or match[2] or "").strip() if match else ""
 
 
-def _believable(latitude: float, longitude: float, height: float) -> tuple[float, float, float] | None:
+def _valid_position(latitude: float, longitude: float, height: float) -> tuple[float, float, float] | None:
     """Return the position, or None if it is invalid: receivers without a fix write zeros."""
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
         return None

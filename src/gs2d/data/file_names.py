@@ -51,7 +51,7 @@ class Files:
         names: Sequence[Sequence[str]],
         *,
         not_in: Collection[str] = (),
-        taken: Collection[Path] = (),
+        used: Collection[Path] = (),
         moved: bool = True,
     ) -> list[Match]:
         """Return the file of each name.
@@ -61,24 +61,24 @@ class Files:
         name has a file in its own folder.
 
         ``names``: spellings of each name, most likely first. ``not_in``: folder names, in lower case, whose files match
-        only by their exact path. ``taken``: files that match only by their exact path. ``moved``: whether files in
+        only by their exact path. ``used``: files that match only by their exact path. ``moved``: whether files in
         contradicting folders may match at all.
         """
-        found = [self._exact(spellings) for spellings in names]
-        owned = {match.path for match in found if match.path is not None} | set(taken)
-        found = [
+        matches = [self._exact(spellings) for spellings in names]
+        owned = {match.path for match in matches if match.path is not None} | set(used)
+        matches = [
             match if match.path else self._best(spellings, not_in, owned)
-            for match, spellings in zip(found, names, strict=True)
+            for match, spellings in zip(matches, names, strict=True)
         ]
-        if not moved or any(match.path and not match.elsewhere for match in found):
-            found = [Match() if match.elsewhere else match for match in found]
+        if not moved or any(match.path and not match.elsewhere for match in matches):
+            matches = [Match() if match.elsewhere else match for match in matches]
         owners: dict[Path, dict[str, tuple[int, ...]]] = {}
-        for match, spellings in zip(found, names, strict=True):
+        for match, spellings in zip(matches, names, strict=True):
             if match.path is not None and match.rank:
                 owners.setdefault(match.path, {})[spellings[0]] = match.rank
         return [
             Match() if match.path and match.rank and not _owns(spellings[0], owners[match.path]) else match
-            for match, spellings in zip(found, names, strict=True)
+            for match, spellings in zip(matches, names, strict=True)
         ]
 
     def of_stem(self, name: str, suffixes: Collection[str], not_in: Collection[str] = ()) -> Path | None:
@@ -106,7 +106,7 @@ class Files:
                 self._entries[folder] = frozenset()
         return name in self._entries[folder] and os.path.isfile(path)
 
-    def _best(self, spellings: Sequence[str], not_in: Collection[str], taken: Collection[Path | None]) -> Match:
+    def _best(self, spellings: Sequence[str], not_in: Collection[str], used: Collection[Path | None]) -> Match:
         """Return the file with the longest common end of its path."""
         for folder in self._folders:
             for name in spellings:
@@ -115,7 +115,7 @@ class Files:
                     match
                     for own in self._below(folder).get(folded(parts[-1]) if parts else "", ())
                     if not any(part.lower() in not_in or _SMALLER.fullmatch(part) for part in own[:-1])
-                    and (match := _compare(folder, own, parts)).path not in taken
+                    and (match := _compare(folder, own, parts)).path not in used
                 ]
                 most = max((match.rank for match in matches), default=())
                 best = [match for match in matches if match.rank == most]
@@ -238,7 +238,7 @@ def find_photographs(
     paths = [match.path for match in matches if match.path is not None]
     if not any(path.is_relative_to(home) for path in paths for home in homes):
         homes = _shared(paths)
-    found = {}
+    photographs = {}
     for name, match in zip(names, matches, strict=True):
         if match.several:
             raise DataError(
@@ -250,13 +250,13 @@ def find_photographs(
             other = files.of_stem(name, IMAGES, NO_PHOTOGRAPHS)
             if other is not None:
                 why += f"; {other.parent.name}/{other.name} exists: use its suffix in the camera file"
-            found[name] = ImageFile(None, reason=why)
+            photographs[name] = ImageFile(None, reason=why)
         elif match.path.suffix.lower() in UNREAD and head(match.path)[4:8] == _BOXES:
             suffix = match.path.suffix.lower()
-            found[name] = ImageFile(None, reason=f"{suffix[1:].upper()} cannot be read; {remedy(suffix)}")
+            photographs[name] = ImageFile(None, reason=f"{suffix[1:].upper()} cannot be read; {remedy(suffix)}")
         else:
-            found[name] = ImageFile(match.path, name_below(match.path, homes))
-    return found
+            photographs[name] = ImageFile(match.path, name_below(match.path, homes))
+    return photographs
 
 
 def _shared(paths: Sequence[Path]) -> list[Path]:

@@ -35,32 +35,32 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     Raises DataError if the folder is missing, empty or of unknown format; lists the expected files.
     """
     root = _folder(path)
-    looked_for = []
+    expected = []
     readers = [(name, make()) for name, make in READERS.working()]
     for name, reader in sorted(readers, key=lambda pair: not getattr(pair[1], "before_colmap", False)):
         if reader.detect(root):
             return name
-        looked_for.append(getattr(reader, "looks_for", ""))
-    held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
-    if not held:
+        expected.append(getattr(reader, "looks_for", ""))
+    entries = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
+    if not entries:
         raise DataError(f"{root} must hold a capture, got an empty folder{suggestion(root, 'capture')}")
-    if "run.json" in held:
+    if "run.json" in entries:
         raise DataError(f"{root} must hold a capture, got a run{suggestion(root, 'capture')}")
-    project = next((name for name in held if os.path.splitext(name)[1].lower() in _PROJECTS), None)
+    project = next((name for name in entries if os.path.splitext(name)[1].lower() in _PROJECTS), None)
     if project is not None:
         remedy = _PROJECTS[os.path.splitext(project)[1].lower()]
         raise DataError(f"{root} must contain exported cameras, got the project file {project}: {remedy}")
-    lacking = missing_lines(root)
-    hint = f"; {lacking[0]}" if lacking else ""
+    missing = missing_lines(root)
+    hint = f"; {missing[0]}" if missing else ""
     images = next((folder for folder in (root, in_any_case(root, "images")) if _images(folder)), None)
-    if images is not None and not lacking:
+    if images is not None and not missing:
         raise DataError(
             f"{root} must contain cameras, got {_images(images)} images without cameras{suggestion(root, 'capture')}"
         )
-    *others, last = filter(None, looked_for)
+    *others, last = filter(None, expected)
     raise DataError(
         f"{root} must hold {', '.join(others)} or {last}; "
-        f"got {', '.join(held[:8])}{' ...' if len(held) > 8 else ''}{hint}"
+        f"got {', '.join(entries[:8])}{' ...' if len(entries) > 8 else ''}{hint}"
     )
 
 
@@ -75,8 +75,8 @@ def _folder(path: str | os.PathLike[str]) -> Path:
     try:
         os.listdir(root)
     except (FileNotFoundError, NotADirectoryError) as error:
-        got = f"a file{suggestion(root, 'capture')}" if root.exists() else f"no such folder{path_hint(root)}"
-        raise DataError(f"{root} must be the folder of a capture, got {got}") from error
+        actual = f"a file{suggestion(root, 'capture')}" if root.exists() else f"no such folder{path_hint(root)}"
+        raise DataError(f"{root} must be the folder of a capture, got {actual}") from error
     except OSError as error:
         raise DataError(f"cannot read the folder {root}: {error.strerror or error}") from error
     return root

@@ -1,4 +1,4 @@
-"""Masks of images: where they are found, and what a black pixel means.
+"""Masks of images: where they are, and what a black pixel means.
 
 White = keep. A black pixel is *ignored* (never used), or *empty* (transparent, as alpha 0).
 """
@@ -43,7 +43,7 @@ class Masks:
         return {name: value for name, value in options.items() if value is not None}
 
     @property
-    def asked_for(self) -> bool:
+    def requested(self) -> bool:
         """Whether the user requests masks, whatever the protocol."""
         return self.masked == IGNORE or (self.masked is None and self.folder is not None)
 
@@ -99,12 +99,12 @@ def find_masks(
     else:
         folders = [folder for home in dict.fromkeys(homes) if (folder := in_any_case(home, FOLDER)).is_dir()]
         places = {_NAMED: named, FOLDER: find_masks_in(folders, names), _BESIDE: _masks_beside(images)}
-    found: list[Path | None] = [None] * len(names)
+    chosen: list[Path | None] = [None] * len(names)
     counts: Counter[str] = Counter()
     for where, paths in places.items():
         for index, path in enumerate(paths):
-            if path is not None and found[index] is None:
-                found[index] = path
+            if path is not None and chosen[index] is None:
+                chosen[index] = path
                 counts[where] += 1
     count = counts.total()
     if masks.folder is not None and not count:
@@ -113,10 +113,10 @@ def find_masks(
             f"{names[0]}.png, {Path(names[0]).with_suffix('.png')} or {Path(names[0]).stem}{ENDING}.png"
         )
     if not count:
-        vain = "" if masks.masked is None else f": --masked {masks.masked} has no effect"
-        line = f"masks: none of {len(names)} views has one in {FOLDER} (a/b.jpg.png for a/b.jpg){vain}"
-        return found, line if folders or vain else ""
+        unused = "" if masks.masked is None else f": --masked {masks.masked} has no effect"
+        line = f"masks: none of {len(names)} views has one in {FOLDER} (a/b.jpg.png for a/b.jpg){unused}"
+        return chosen, line if folders or unused else ""
     in_what = " and ".join(counts)
     rest = f"; the other {len(names) - count} are whole" if count < len(names) else ""
-    meaning = ", the rest is empty" if masks.masked == EMPTY else ", the rest is ignored" if masks.asked_for else ""
-    return found, f"masks: {count} of {len(names)} views have one in {in_what} (white = keep{meaning}){rest}"
+    meaning = ", the rest is empty" if masks.masked == EMPTY else ", the rest is ignored" if masks.requested else ""
+    return chosen, f"masks: {count} of {len(names)} views have one in {in_what} (white = keep{meaning}){rest}"

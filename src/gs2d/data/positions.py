@@ -94,8 +94,8 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _read_csv(path: Path, lines: Sequence[tuple[int, str]], epsg: int | None, required: Sequence[str]) -> Table:
-    kept = [(number, text) for number, text in lines if text and not text.startswith("#")]
-    number, head = kept[0]
+    content = [(number, text) for number, text in lines if text and not text.startswith("#")]
+    number, head = content[0]
     delimiter = max(",;\t", key=head.count)
     columns = [name.strip().lower() for name in _split(path, number, head, delimiter)]
     if missing := [name for name in required if name not in columns]:
@@ -104,7 +104,7 @@ def _read_csv(path: Path, lines: Sequence[tuple[int, str]], epsg: int | None, re
             f"layout, which begins with EPSG:CODE), {', '.join(missing)} is missing in {head[:60]!r}"
         )
     rows = []
-    for number, text in kept[1:]:  # line by line, so that an unclosed quote ends with its line
+    for number, text in content[1:]:  # line by line, so that an unclosed quote ends with its line
         words = _split(path, number, text, delimiter)
         if len(words) > len(columns):
             raise DataError(f"{path}, line {number}: {len(columns)} values were expected, got {len(words)}")
@@ -168,7 +168,7 @@ def matched(positions: Positions, names: Sequence[str]) -> dict[str, np.ndarray]
     Names are compared whole, then without suffix, then without folders, then as bare stems. Raises DataError if a
     listed name fits several images.
     """
-    found: dict[str, np.ndarray] = {}
+    places: dict[str, np.ndarray] = {}
     for key in (
         str,
         lambda name: str(PurePosixPath(name).with_suffix("")),
@@ -180,16 +180,16 @@ def matched(positions: Positions, names: Sequence[str]) -> dict[str, np.ndarray]
             by_key.setdefault(key(name), []).append(name)
         for name, place in positions.places.items():
             candidates = by_key.get(key(name), [])
-            if len(candidates) > 1 and not any(one in found for one in candidates):
+            if len(candidates) > 1 and not any(one in places for one in candidates):
                 raise DataError(
                     f"{name} must name one image, got {len(candidates)} of that name "
                     f"({', '.join(sorted(candidates)[:2])}); include their folders"
                 )
             if len(candidates) == 1:
-                found.setdefault(candidates[0], place)
-        if found:
+                places.setdefault(candidates[0], place)
+        if places:
             break
-    return found
+    return places
 
 
 def to_enu(geodetic: np.ndarray, origin: np.ndarray) -> np.ndarray:

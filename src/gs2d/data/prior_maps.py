@@ -56,8 +56,8 @@ class ObservedPoints:
     points: np.ndarray  # [P, 3] float64 world units
     error: np.ndarray  # [P] float64 px; mean reprojection error
     track: np.ndarray  # [P] int64; number of views that observe the point
-    seen: Mapping[str, np.ndarray]  # view name to ndarray [M] int32 or int64; indices of the observed points
-    # Why the capture has no observations; ``seen`` then comes from projecting the points. Empty otherwise.
+    by_view: Mapping[str, np.ndarray]  # view name to ndarray [M] int32 or int64; indices of the observed points
+    # Why the capture has no observations; ``by_view`` then comes from projecting the points. Empty otherwise.
     guessed: str = ""
 
     @classmethod
@@ -69,9 +69,9 @@ class ObservedPoints:
         """
         points = np.zeros((0, 3)) if points is None else np.asarray(points, dtype=np.float64)
         some = np.arange(0, len(points), max(1, -(-len(points) // MAX_PROJECTED)), dtype=np.int32)
-        seen = {name: some[_unhidden(points[some], camera)] for name, camera in cameras.items()}
-        track = np.bincount(np.concatenate([*seen.values(), some[:0]]), minlength=len(points))
-        return cls(points, np.zeros(len(points)), track, seen, why)
+        by_view = {name: some[_unoccluded(points[some], camera)] for name, camera in cameras.items()}
+        track = np.bincount(np.concatenate([*by_view.values(), some[:0]]), minlength=len(points))
+        return cls(points, np.zeros(len(points)), track, by_view, why)
 
     def in_view(self, name: str, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
         """Return the points that a view observes, in front of it and inside its outer pixel centres.
@@ -79,7 +79,7 @@ class ObservedPoints:
         ``camera`` has the training size. ``min_track`` is the least number of views per point, ``max_error`` (px) the
         largest mean reprojection error.
         """
-        rows = self.seen.get(name, np.zeros(0, dtype=np.int64))
+        rows = self.by_view.get(name, np.zeros(0, dtype=np.int64))
         return self._project(rows, camera, min_track, max_error)
 
     def inside(self, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
@@ -94,7 +94,7 @@ class ObservedPoints:
         return PointsInView(pixels[inside], depth[inside])
 
 
-def _unhidden(points: np.ndarray, camera: Camera) -> np.ndarray:
+def _unoccluded(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Return which points [P] bool lie in an image and not far behind another point of the same cell."""
     pixels, depth = camera.project(points)
     size = np.array((camera.width, camera.height))
@@ -275,8 +275,8 @@ def sample(values: np.ndarray, positions: np.ndarray, valid: np.ndarray) -> np.n
     weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])
     least, most = four.min(axis=0), four.max(axis=0)
     smooth = (least > 0) & (most - least <= AGREE * most)
-    found = np.where(smooth, (four * weights).sum(axis=0), nearest)
-    return np.where(valid, found, 0).astype(np.float32)
+    sampled = np.where(smooth, (four * weights).sum(axis=0), nearest)
+    return np.where(valid, sampled, 0).astype(np.float32)
 
 
 def _nearest(positions: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -63,9 +63,9 @@ class View:
         camera = replace(self.camera, T_cam_world=T_cam_world)
         return self._sharing(camera=camera) if zoom is None else self._sharing(camera=camera.zoomed(zoom), zoom=zoom)
 
-    def with_appearance(self, found: Appearance) -> View:
+    def with_appearance(self, appearance: Appearance) -> View:
         """Return the view with further appearance parameters."""
-        return self._sharing(appearance={**self.appearance, **found})
+        return self._sharing(appearance={**self.appearance, **appearance})
 
     def _sharing(self, **changes: Any) -> View:
         """Return a changed view whose image stays in the cache of this view."""
@@ -234,13 +234,13 @@ class Scene:
         train = tuple(moved(view, poses.get(view.name)) for view in self.train)
         return replace(self, train=train, test=tuple(moved(view, None) for view in self.test))
 
-    def with_appearance(self, found: Mapping[str, Appearance]) -> Scene:
+    def with_appearance(self, by_name: Mapping[str, Appearance]) -> Scene:
         """Return the scene with appearance parameters, by name of the view."""
 
-        def seen(views: tuple[View, ...]) -> tuple[View, ...]:
-            return tuple(view.with_appearance(found[view.name]) if view.name in found else view for view in views)
+        def updated(views: tuple[View, ...]) -> tuple[View, ...]:
+            return tuple(view.with_appearance(by_name[view.name]) if view.name in by_name else view for view in views)
 
-        return replace(self, train=seen(self.train), test=seen(self.test))
+        return replace(self, train=updated(self.train), test=updated(self.test))
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -258,10 +258,10 @@ class Scene:
         if self.observe is None or (self.unobserved() and not guessed):
             return None
         try:
-            found = self.observe()
+            observed = self.observe()
         except DataError:  # from a third-party reader
             return None
-        return found if any(map(len, found.seen.values())) else None
+        return observed if any(map(len, observed.by_view.values())) else None
 
     def unobserved(self) -> str:
         """Return why the capture has no observations of points; "" if it has."""

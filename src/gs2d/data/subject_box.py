@@ -132,12 +132,12 @@ def check_subject_box(box: Sequence[float] | None, others: Mapping[str, bool]) -
     if box is None:
         return
     checked_box(box, "--subject-box")
-    for option, given in others.items():
-        if given:
+    for option, is_set in others.items():
+        if is_set:
             raise ProtocolError(f"--subject-box and {option} exclude each other, got both; leave one out")
 
 
-def given_subject(box: Sequence[float], cameras: Sequence[Camera]) -> Subject:
+def subject_in_box(box: Sequence[float], cameras: Sequence[Camera]) -> Subject:
     """Return the object in a box x0 y0 z0 x1 y1 z1, world units.
 
     Raises DataError if the numbers are not a box.
@@ -208,7 +208,7 @@ def _place(sights: Sequence[Sight]) -> np.ndarray:
         seeds.append(focus_point([sight.camera for sight in sights]))
     chosen = np.unique(np.linspace(0, len(sights) - 1, min(len(sights), _SEEDS)).round().astype(int))
     seeds += [_weighted_median(sights[i].points, sights[i].weights) for i in chosen]
-    center = max(seeds, key=lambda seed: _looked_at(sights, seed))
+    center = max(seeds, key=lambda seed: _mean_vote(sights, seed))
     for _ in range(_STEPS):
         size = frame_size([sight.camera for sight in sights], center)
         near = ((points - center) ** 2).sum(axis=1) <= size**2
@@ -222,7 +222,7 @@ def _place(sights: Sequence[Sight]) -> np.ndarray:
     return center
 
 
-def _looked_at(sights: Sequence[Sight], center: np.ndarray) -> float:
+def _mean_vote(sights: Sequence[Sight], center: np.ndarray) -> float:
     """Return how much cameras look at a point, 0 to 1: the mean part of their votes around it, limited per camera."""
     size = frame_size([sight.camera for sight in sights], center)
     return float(np.mean([min(_fraction(sight, center, 0.7 * size), 0.5) for sight in sights])) * 2 if size > 0 else 0.0
@@ -246,13 +246,13 @@ def _object_box(sights: Sequence[Sight], center: np.ndarray, size: float) -> tup
     weights = np.concatenate([sight.weights for sight in sights])
     near = (((points - center) ** 2).sum(axis=1) <= reach**2) & (weights > 0)
     points, weights = points[near], weights[near]
-    seen = np.zeros(len(points))
+    count = np.zeros(len(points))
     for camera in cameras:
-        seen += shown(camera, points)
-    kept = seen >= SHOWN_BY * len(cameras)
-    if kept.sum() < 2:
+        count += shown(camera, points)
+    common = count >= SHOWN_BY * len(cameras)
+    if common.sum() < 2:
         return None
-    corners = np.array([_weighted_percentiles(axis, weights[kept]) for axis in points[kept].T])
+    corners = np.array([_weighted_percentiles(axis, weights[common]) for axis in points[common].T])
     low, high = corners[:, 0], corners[:, 1]
     side = float((high - low).max())
     if not side > 0:

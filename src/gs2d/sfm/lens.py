@@ -18,8 +18,8 @@ import numpy as np
 from gs2d.sfm.mapping import Steps
 from gs2d.sfm.search import CALIBRATED_ANEW, FISHEYES
 
-# Panoramas (``data.exif.Taken.panorama``) are placed with COLMAP's spherical camera, one pose each; training cuts them
-# into faces (``data.faces``).
+# Panoramas (``data.exif.Metadata.panorama``) are placed with COLMAP's spherical camera, one pose each; training cuts
+# them into faces (``data.faces``).
 PANORAMA = "EQUIRECTANGULAR"
 FINER = 2  # times feature_size: a panorama covers four times the field of view of a photograph
 START, RICH = "SIMPLE_RADIAL", "RADIAL"

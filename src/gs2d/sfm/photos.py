@@ -12,7 +12,7 @@ from PIL import Image
 
 from gs2d.core.image_arrays import is_twice_as_wide, natural_key
 from gs2d.core.missing import belongs_to_run, path_hint, suggestion
-from gs2d.data.exif import Taken, read_taken
+from gs2d.data.exif import Metadata, read_metadata
 from gs2d.data.image_files import AVIF, HEIF, UNREAD, read_image, remedy
 from gs2d.data.masks import FOLDER, without_masks
 from gs2d.errors import DataError
@@ -50,7 +50,7 @@ class Photo:
     # converted.
     name: str
     size: tuple[int, int]  # width and height of the upright image, px
-    metadata: Taken  # ``orientation`` is the rotation that remains to be applied
+    metadata: Metadata  # ``orientation`` is the rotation that remains to be applied
 
     @property
     def orientation(self) -> int:
@@ -155,7 +155,7 @@ def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[
 
 def _read(path: Path, root: Path, name: str) -> Photo:
     height, width = read_image(path).shape[:2]
-    metadata = read_taken(path)
+    metadata = read_metadata(path)
     orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else metadata.orientation  # Pillow rotates TIFF itself
     size = (height, width) if orientation >= 5 else (width, height)
     metadata = replace(metadata, orientation=orientation)
@@ -200,7 +200,7 @@ def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cam
         return [list(range(len(photos)))]
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, (photo, size) in enumerate(zip(photos, sizes, strict=True)):
-        groups.setdefault((os.path.dirname(photo.name), size, photo.metadata.made_by), []).append(i)
+        groups.setdefault((os.path.dirname(photo.name), size, photo.metadata.camera_tags), []).append(i)
     return list(groups.values())
 
 

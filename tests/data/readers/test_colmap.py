@@ -246,14 +246,14 @@ def test_a_model_without_observations_has_its_points_projected_into_the_images(t
     inside = [view.camera.project(observed.points)[0] for view in scene.views]
     near = [((uv > 0) & (uv < (40, 30))).all(axis=1) for uv in inside]
     for view, fits in zip(scene.views, near, strict=True):
-        rows = observed.seen[view.name]
+        rows = observed.by_view[view.name]
         assert 0 < len(rows) <= fits.sum()
         assert fits[rows].all()
     model.images[0] = (*model.images[0][:4], [(1.0, 2.0, 3)])
     model.write(tmp_path / "sparse/0")
     scene = load_scene(tmp_path)
     assert scene.unobserved() == ""
-    assert scene.observed(guessed=False).seen["8.png"].tolist() == [2]  # type: ignore[union-attr]
+    assert scene.observed(guessed=False).by_view["8.png"].tolist() == [2]  # type: ignore[union-attr]
 
 
 def test_an_unsupported_camera_model_is_an_error_with_a_remedy(tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def _named(entries: Sequence[_Entry], key: str, files: Files, taken: Collection[
         for entry in entries
     ]
     others = set(_NAMED.values()) - {_NAMED[key]}
-    found = iter(files.match([[name] for name in names if name is not None], not_in=others, taken=taken))
+    found = iter(files.match([[name] for name in names if name is not None], not_in=others, used=taken))
     return [None if name is None else next(found).path for name in names]
 
 

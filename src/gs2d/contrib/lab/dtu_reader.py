@@ -111,8 +111,8 @@ def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:
     """Return the observations of the model by image name of the scan, whose suffix may differ."""
     found = observed_points(model.folder, model.kind)
     by_stem = {Path(frame.name).stem: frame.name for frame in frames}
-    seen = {by_stem[Path(name).stem]: rows for name, rows in found.seen.items() if Path(name).stem in by_stem}
-    return replace(found, seen=seen)
+    seen = {by_stem[Path(name).stem]: rows for name, rows in found.by_view.items() if Path(name).stem in by_stem}
+    return replace(found, by_view=seen)
 
 
 def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float, float, np.ndarray]:

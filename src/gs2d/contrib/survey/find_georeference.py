@@ -27,7 +27,7 @@ from gs2d.contrib.survey.survey_commands import GeoreferenceOptions
 from gs2d.core.camera import Camera
 from gs2d.core.similarity import rotation_to_z
 from gs2d.data import View
-from gs2d.data.exif import read_taken
+from gs2d.data.exif import read_metadata
 from gs2d.data.positions import Positions, matched, read_positions
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import GEOREFERENCE, POSES, RunFolder, open_run
@@ -190,7 +190,7 @@ def _positions(views: Sequence[View], options: GeoreferenceOptions, on_event: On
         return read_positions(options.positions)
     found = {}
     for view in counted(views, "reading EXIF", len(views), on_event):
-        place = None if view.path is None else read_taken(view.path).place
+        place = None if view.path is None else read_metadata(view.path).place
         if place is not None:
             found[view.name] = np.array(place)
     if not found:

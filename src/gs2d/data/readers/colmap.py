@@ -380,12 +380,12 @@ def read_colmap(root: Path, downscale: int) -> Capture:
     orientation is ignored, as in COLMAP. Raises DataError if the model is missing or invalid, a camera model is not
     supported, or there is no folder of images.
     """
-    found = model_folder(root)
-    if found is None:
+    model = model_folder(root)
+    if model is None:
         raise DataError(
             f"{root} must hold a COLMAP model: cameras.bin and images.bin (or .txt) in sparse/0, sparse or itself"
         )
-    folder, kind = found
+    folder, kind = model
     cameras = read_cameras(folder, kind)
     images = list(_each_image(folder, kind, observations=False))
     home, photographs = _photographs(root, folder, kind, images)
@@ -393,7 +393,7 @@ def read_colmap(root: Path, downscale: int) -> Capture:
     scaled = in_any_case(home, f"images_{downscale}")
     factor = 1
     if downscale > 1 and scaled.is_dir():
-        smaller = _found(images, [scaled], _file(folder, "images", kind))
+        smaller = _image_files(images, [scaled], _file(folder, "images", kind))
         if any(photo.path is not None for photo in smaller.values()):
             photographs, factor = smaller, downscale
             notes.append(f"images of 1/{downscale} size are read from {scaled.name}")
@@ -453,15 +453,15 @@ def observed_points(folder: Path, kind: str, names: Mapping[str, str] | None = N
         raise DataError(f"{folder} must hold sparse points in points3D.{kind}, got none")
     order = np.argsort(points.ids)
     track = np.zeros(len(order), dtype=np.int64)
-    seen = {}
+    by_view = {}
     for image in _each_image(folder, kind, observations=True):  # one at a time: observations are large
         assert image.point_ids is not None
         ids = np.unique(image.point_ids[image.point_ids >= 0])
         at = order[np.searchsorted(points.ids, ids, sorter=order).clip(max=len(order) - 1)]
         rows = at[points.ids[at] == ids]
-        seen[image.name if names is None else names.get(image.name, image.name)] = rows.astype(np.int32)
+        by_view[image.name if names is None else names.get(image.name, image.name)] = rows.astype(np.int32)
         track[rows] += 1
-    return ObservedPoints(points.xyz, points.error, track, seen)
+    return ObservedPoints(points.xyz, points.error, track, by_view)
 
 
 def model_points(folder: Path, kind: str) -> PointCloud | None:
@@ -494,10 +494,10 @@ def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) 
     listing = _file(model, "images", kind)
     for home in homes:
         if (at := in_any_case(home, "images")).is_dir():
-            return home, _found(images, [at], listing)
+            return home, _image_files(images, [at], listing)
     exact = (home for home in homes if any((home / image.name).is_file() for image in images))
     home = next(exact, root)  # folders above root are not searched
-    photographs = _found(images, [home], listing)
+    photographs = _image_files(images, [home], listing)
     if any(photo.path is not None for photo in photographs.values()):
         return home, photographs
     raise DataError(
@@ -506,7 +506,7 @@ def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) 
     )
 
 
-def _found(images: list[ColmapImage], folders: list[Path], listing: Path) -> dict[str, ImageFile]:
+def _image_files(images: list[ColmapImage], folders: list[Path], listing: Path) -> dict[str, ImageFile]:
     reason = f"no such file in {folders[0].name}"
     return find_photographs([image.name for image in images], folders, listing, reason=reason)
 
@@ -525,9 +525,9 @@ def _other_models(folder: Path) -> list[str]:
 
 def _check_factor(path: Path, k: Intrinsics, factor: int) -> None:
     """Check that a file in ``images_N`` has 1/N of the camera's image size, up to rounding."""
-    got, expected = np.array(image_size(path)), np.array((k.width, k.height)) / factor
-    if (np.abs(got - expected) > np.maximum(1.0, 0.01 * expected)).any():
+    size, expected = np.array(image_size(path)), np.array((k.width, k.height)) / factor
+    if (np.abs(size - expected) > np.maximum(1.0, 0.01 * expected)).any():
         raise DataError(
-            f"{path} must be 1/{factor} of its camera's {k.width}x{k.height}, got {got[0]}x{got[1]}; "
+            f"{path} must be 1/{factor} of its camera's {k.width}x{k.height}, got {size[0]}x{size[1]}; "
             f"remove or rebuild the folder {path.parent.name}"
         )

@@ -21,10 +21,10 @@ from gs2d.data.subject_box import (
     check_subject_box,
     checked_box,
     find_subject,
-    given_subject,
     middle_weights,
     read_subject,
     shown,
+    subject_in_box,
 )
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import SUBJECT, RunFolder
@@ -54,7 +54,7 @@ def subject_in(trained: Trained, box: Sequence[float] | None = None) -> Subject:
         centers_inside(trained.splats, box, "--subject-box")
     try:
         cameras = [view.camera for view in trained.scene.train]
-        return find_subject(sights(trained)) if box is None else given_subject(box, cameras)
+        return find_subject(sights(trained)) if box is None else subject_in_box(box, cameras)
     except DataError as error:
         raise ProtocolError(str(error)) from error
 
@@ -160,7 +160,7 @@ def _sight(
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     z = depth[rows, columns]
     surface = backproject(camera, z, rows, columns)
-    near = np.ones(len(surface), dtype=bool) if reach is None else reach.holds(surface)
+    near = np.ones(len(surface), dtype=bool) if reach is None else reach.contains(surface)
     surface, pixels = surface[near], pixels[near]
     visible = _visible(camera, depth, points)
     parts = [(surface, middle_weights(camera, pixels)), (visible, middle_weights(camera, camera.project(visible)[0]))]

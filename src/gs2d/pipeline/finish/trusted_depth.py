@@ -40,7 +40,7 @@ def within_reach(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray
     """Return which depths [H, W] are of points within reach, [H, W] bool."""
     rows, columns = np.indices(depths.shape).reshape(2, -1)
     places = backproject(camera, depths.reshape(-1).astype(np.float64), rows, columns)
-    return reach.holds(places).reshape(depths.shape)
+    return reach.contains(places).reshape(depths.shape)
 
 
 def sky_direction(trained: Trained) -> np.ndarray | None:

@@ -440,6 +440,6 @@ def _of_priors(view: View, plan: DepthPlan | None, normal: NormalTarget | None) 
     if plan is not None and plan.source != "sparse" and view.maps is not None and view.maps.files.depth is not None:
         arrays.append(view.maps.depth().values)
     if plan is not None and plan.observed is not None:
-        rows = plan.observed.seen.get(view.name, np.zeros(0, dtype=np.int64))
+        rows = plan.observed.by_view.get(view.name, np.zeros(0, dtype=np.int64))
         arrays += [values[rows] for values in (plan.observed.points, plan.observed.error, plan.observed.track)]
     return arrays

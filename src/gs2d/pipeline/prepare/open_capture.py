@@ -190,7 +190,7 @@ def with_masks(protocol: Protocol, scene: Scene, on_event: OnEvent) -> Protocol:
     masks = scene.masks
     if not masks.found or masks.masked == EMPTY or protocol.use_mask_in_training:
         return protocol
-    if masks.asked_for:
+    if masks.requested:
         return replace(protocol, use_mask_in_training=True, use_mask_in_fusion=True)
     on_event(Notice(f"the protocol {protocol.name} trains on masked pixels too (--masked ignore excludes them)"))
     return protocol
@@ -209,7 +209,7 @@ def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -
         return scene
     masked, valid = np.zeros((2, len(points)), dtype=np.int64)
     for view in scene.train:
-        rows = observed.seen.get(view.name)
+        rows = observed.by_view.get(view.name)
         if rows is None or not len(rows):
             continue
         shown = _unmasked_pixels(view)

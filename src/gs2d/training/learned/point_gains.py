@@ -39,7 +39,7 @@ def point_gains(scene: Scene) -> np.ndarray | None:
 def _colors(view: View, observed: ObservedPoints) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows [M] of points that a view shows well, and their colours [M, 3] in (0, 1)."""
     camera = view.camera
-    rows = observed.seen.get(view.name, np.zeros(0, dtype=np.int64))
+    rows = observed.by_view.get(view.name, np.zeros(0, dtype=np.int64))
     rows = rows[(observed.track[rows] >= MIN_TRACK) & np.isfinite(observed.points[rows]).all(axis=1)]
     pixels, depth = camera.project(observed.points[rows])
     column, row = np.floor(pixels).astype(np.int64).T

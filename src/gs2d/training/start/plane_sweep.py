@@ -231,7 +231,7 @@ def _neighbours(
     """
     count = len(views)
     centers = np.stack([view.camera.center for view in scene.train])
-    shared_points = _shared([observed.seen.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train])
+    shared_points = _shared([observed.by_view.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train])
     chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_VIEWS)).round().astype(int)).tolist()
 
     def compared(index: int) -> tuple[int, ...]:
