@@ -42,8 +42,8 @@ def source_of(where: str) -> str:
 @cache
 def _exports() -> dict[str, tuple[str, list[str]]]:
     """Return the type of the result and the parameters of each function that the CPU library exports."""
-    found = EXPORT.findall(source_of("cpu"))
-    return {name: (result, [p for p in parameters.split(",") if p.strip()]) for result, name, parameters in found}
+    exports = EXPORT.findall(source_of("cpu"))
+    return {name: (result, [p for p in parameters.split(",") if p.strip()]) for result, name, parameters in exports}
 
 
 def signature_of(function: str, real: Any) -> tuple[Any, list[Any]]:
@@ -66,7 +66,7 @@ def structure(name: str, where: str) -> type[ctypes.Structure]:
     ``where`` is the folder "cpu" or "cuda", or a source file in ``kernels/`` if the name is not unique.
     """
     text = source_of(where)
-    (members,) = (members for known, members in STRUCTURE.findall(text) if known == name)
+    (members,) = (members for own_name, members in STRUCTURE.findall(text) if own_name == name)
     fields: list[tuple[str, Any]] = []
     for kind, declarators in MEMBER.findall(members):
         for declarator in declarators.split(","):
@@ -74,8 +74,8 @@ def structure(name: str, where: str) -> type[ctypes.Structure]:
             member = ctypes.c_void_p if "*" in plain else SCALARS[kind] if kind in SCALARS else structure(kind, where)
             sizes = LENGTH.findall(declarator)  # numbers or names of constants
             if sizes:
-                known_sizes = (x if x.isdigit() else re.findall(rf"\b{x} = (\d+)", text)[0] for x in sizes)
-                member *= math.prod(map(int, known_sizes))
+                lengths = (x if x.isdigit() else re.findall(rf"\b{x} = (\d+)", text)[0] for x in sizes)
+                member *= math.prod(map(int, lengths))
             fields.append((re.findall(r"\w+", plain)[-1], member))
     return type(name, (ctypes.Structure,), {"__slots__": (), "_fields_": fields})
 
@@ -90,6 +90,6 @@ def fill(target: ctypes.Structure, /, **fields: Any) -> None:
 
 def filled(kind: type[ctypes.Structure], /, **fields: Any) -> ctypes.Structure:
     """Return a structure with these fields; all others are 0 or null."""
-    made = kind()
-    fill(made, **fields)
-    return made
+    target = kind()
+    fill(target, **fields)
+    return target

@@ -135,16 +135,16 @@ def load(variant: str | None = None) -> Library:
 
 
 @cache  # an iteration calls it three times, and checking the files takes 0.2 ms
-def _choose(folder: Path, wanted: str | None) -> Library:
+def _choose(folder: Path, variant: str | None) -> Library:
     """Return the library of a variant in a folder; errors are not cached."""
     choices = available_variants()
     if not choices:
         raise BackendError(f"expected the native CPU library in the package's kernels/lib, found none; {REMEDY}")
-    if wanted is None:
+    if variant is None:
         return _load(choices[0])
-    if wanted in choices or (wanted == "f64" and _path("f64").exists()):
-        return _load(wanted)
-    raise BackendError(f"CPU variant must be one of {', '.join(choices)}, got {wanted!r}; unset GS2D_CPU_VARIANT")
+    if variant in choices or (variant == "f64" and _path("f64").exists()):
+        return _load(variant)
+    raise BackendError(f"CPU variant must be one of {', '.join(choices)}, got {variant!r}; unset GS2D_CPU_VARIANT")
 
 
 def ready_library() -> Library:

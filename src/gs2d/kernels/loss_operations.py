@@ -19,11 +19,11 @@ from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 
 Vjp: TypeAlias = Callable[..., Sequence[Tensor | None]]
-"""Gradients of the first tensors of a loss, from its tensors, those that it kept, which need one, and the cotangents.
+"""Gradients of the first tensors of a loss, from its tensors, those that it saved, which need one, and the cotangents.
 
 Of several cotangents, some may be None, which is 0.
 """
-Kept: TypeAlias = Sequence[Tensor | None]
+Saved: TypeAlias = Sequence[Tensor | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,8 @@ class LossOperations:
 
     All of them raise ShapeError if shapes differ, or if a tensor has another dtype or device than the processor needs.
     A subclass implements the methods with an underscore, which get checked, contiguous tensors and return the values of
-    a loss, the tensors that it keeps for the backward pass, and its :data:`Vjp`, which is only called if gradients are
-    ``wanted``.
+    a loss, the tensors that it saves for the backward pass, and its :data:`Vjp`, which is only called if gradients are
+    needed (``grad``).
     """
 
     @property
@@ -57,21 +57,21 @@ class LossOperations:
         raise NotImplementedError
 
     def _photometric(
-        self, *images: Tensor | None, expected: tuple[float, float, float], wanted: bool
-    ) -> tuple[tuple[Tensor, Tensor, Tensor], Kept, Vjp]:
+        self, *images: Tensor | None, expected: tuple[float, float, float], grad: bool
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Saved, Vjp]:
         """``images``: rendered, target, mask and target_mean."""
         raise NotImplementedError
 
     def _normal_consistency(
-        self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, wanted: bool
-    ) -> tuple[Tensor, Kept, Vjp]:
+        self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, grad: bool
+    ) -> tuple[Tensor, Saved, Vjp]:
         raise NotImplementedError
 
-    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Kept, Vjp]:
+    def _normal_smoothness(self, *images: Tensor | None, expected: float, grad: bool) -> tuple[Tensor, Saved, Vjp]:
         """``images``: normal, alpha, flatness and mask."""
         raise NotImplementedError
 
-    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Kept, Vjp]:
+    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Saved, Vjp]:
         raise NotImplementedError
 
     def photometric(
@@ -94,7 +94,7 @@ class LossOperations:
         shapes |= {} if target_mean is None else {"target_mean": (target_mean, "H W 3")}
         check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
         _, target, target_mean = self._ready(rendered=rendered, target=target, target_mean=target_mean)
-        loss = partial(self._photometric, expected=expected, wanted=needs_gradient(rendered))
+        loss = partial(self._photometric, expected=expected, grad=needs_gradient(rendered))
         l1, ssim, l2 = _Fused.apply(loss, rendered.contiguous(), target, _mask_of(mask, rendered), target_mean)
         return l1, ssim, l2
 
@@ -114,8 +114,8 @@ class LossOperations:
             raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
         *_, weights = self._ready(normal=normal, depth=depth, alpha=alpha, weights=how.weights)
         how = replace(how, mask=_mask_of(how.mask, normal), weights=weights)
-        wanted = needs_gradient(normal, depth, alpha)
-        loss = partial(self._normal_consistency, how=how, expected=expected, wanted=wanted)
+        grad = needs_gradient(normal, depth, alpha)
+        loss = partial(self._normal_consistency, how=how, expected=expected, grad=grad)
         value: Tensor = _Fused.apply(loss, normal.contiguous(), depth.contiguous(), alpha.contiguous())
         return value
 
@@ -131,7 +131,7 @@ class LossOperations:
         if flatness.dtype != torch.uint8 or flatness.device != normal.device:
             raise ShapeError(f"flatness must be uint8 on {normal.device}, got {flatness.dtype} on {flatness.device}")
         _, alpha = self._ready(normal=normal, alpha=alpha)
-        loss = partial(self._normal_smoothness, expected=expected, wanted=needs_gradient(normal))
+        loss = partial(self._normal_smoothness, expected=expected, grad=needs_gradient(normal))
         value: Tensor = _Fused.apply(loss, normal.contiguous(), alpha, flatness.contiguous(), _mask_of(mask, normal))
         return value
 
@@ -147,21 +147,21 @@ class LossOperations:
 
 
 class _Fused(torch.autograd.Function):
-    """The values of a loss of some tensors; ``loss`` returns them, what it keeps and its :data:`Vjp`."""
+    """The values of a loss of some tensors; ``loss`` returns them, what it saves and its :data:`Vjp`."""
 
     @staticmethod
-    def forward(ctx: Any, loss: Callable[..., tuple[Any, Kept, Vjp]], *tensors: Tensor | None) -> Any:
-        values, kept, ctx.vjp = loss(*tensors)
+    def forward(ctx: Any, loss: Callable[..., tuple[Any, Saved, Vjp]], *tensors: Tensor | None) -> Any:
+        values, saved, ctx.vjp = loss(*tensors)
         ctx.count = len(tensors)
-        ctx.save_for_backward(*tensors, *kept)  # notices if a caller changes one in place
+        ctx.save_for_backward(*tensors, *saved)  # notices if a caller changes one in place
         ctx.set_materialize_grads(isinstance(values, Tensor))
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        tensors, kept = ctx.saved_tensors[: ctx.count], ctx.saved_tensors[ctx.count :]
-        gradients = ctx.vjp(tensors, kept, ctx.needs_input_grad[1:], *cotangents)
+        tensors, saved = ctx.saved_tensors[: ctx.count], ctx.saved_tensors[ctx.count :]
+        gradients = ctx.vjp(tensors, saved, ctx.needs_input_grad[1:], *cotangents)
         return None, *gradients, *[None] * (len(tensors) - len(gradients))
 
 

@@ -24,7 +24,7 @@ class BestPlanes:
 
 def sweep_planes(
     image: Tensor,
-    wanted: Tensor,
+    mask: Tensor,
     others: Sequence[Tensor],
     turned: Tensor,
     moved: Tensor,
@@ -35,7 +35,7 @@ def sweep_planes(
 ) -> BestPlanes | None:
     """Find the best plane of each pixel of a grey image [H, W] float32; None without the native library.
 
-    Pixels that are not ``wanted`` [H, W] bool may have the score -1. Each of the n other images [h, w] float32 has its
+    Pixels outside of ``mask`` [H, W] bool may have the score -1. Each of the n other images [h, w] float32 has its
     own size; it shows pixel (x, y, 1) at depth z at ``z turned (x, y, 1) + moved``, homogeneous, with ``turned`` [n, 3,
     3] and ``moved`` [n, 3] float32. ``depths`` [D] float32 are in world units. Patches have 2 ``radius`` + 1 pixels per
     side; images are mirrored at their edges. ``noise`` is the variance of image noise, added to both variances of the
@@ -46,7 +46,7 @@ def sweep_planes(
         return None
     height, width = image.shape
     images = [F.pad(tensor[None], (0, 1, 0, 1), mode="replicate")[0].contiguous() for tensor in others]
-    inputs = {"image": image, "wanted": wanted.to(torch.uint8), "turned": turned, "moved": moved, "depths": depths}
+    inputs = {"image": image, "wanted": mask.to(torch.uint8), "turned": turned, "moved": moved, "depths": depths}
     inputs = {name: tensor.contiguous() for name, tensor in inputs.items()}
     sizes = torch.tensor([list(tensor.shape) for tensor in others], dtype=torch.int64)
     addresses = torch.tensor([tensor.data_ptr() for tensor in images], dtype=torch.int64)

@@ -35,12 +35,12 @@ def adam_step(updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps:
 @torch.no_grad()
 def accumulate(signed: Tensor, absolute: Tensor, count: Tensor, signal: Tensor, radii: Tensor) -> None:
     """Add the norms of the signal of visible splats and count these splats (``Backend.accumulate``)."""
-    seen = radii > 0
+    visible = radii > 0
     zero = torch.zeros_like(signed)
-    signed += torch.where(seen, torch.linalg.vector_norm(signal[:, :2], dim=1), zero)
+    signed += torch.where(visible, torch.linalg.vector_norm(signal[:, :2], dim=1), zero)
     if signal.shape[1] == 4:
-        absolute += torch.where(seen, torch.linalg.vector_norm(signal[:, 2:], dim=1), zero)
-    count += seen
+        absolute += torch.where(visible, torch.linalg.vector_norm(signal[:, 2:], dim=1), zero)
+    count += visible
 
 
 def finite(tensor: Tensor) -> bool:

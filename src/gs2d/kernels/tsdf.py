@@ -68,10 +68,10 @@ def arguments_of(
     for name, array in arrays.items():
         if array is None:
             continue
-        wanted = "int64" if name == "rows" else "float32"
+        dtype = "int64" if name == "rows" else "float32"
         contiguous = array.flags.c_contiguous if isinstance(array, np.ndarray) else array.is_contiguous()
-        if not contiguous or str(array.dtype).removeprefix("torch.") != wanted:
-            raise ShapeError(f"{name} must be contiguous {wanted} for the fusion kernels, got {array.dtype}")
+        if not contiguous or str(array.dtype).removeprefix("torch.") != dtype:
+            raise ShapeError(f"{name} must be contiguous {dtype} for the fusion kernels, got {array.dtype}")
     sizes = {"blocks": len(rows), "height": size[0], "width": size[1]}
     return filled(structure("FuseArguments", "core/fuse.h"), **arrays, **sizes, truncation=truncation)
 

@@ -135,11 +135,11 @@ with FakeTensorMode():
         there_and_back(kernel_backend._Rasterize, (*[False] * 8, True, True), options, None, None, None, *tensors)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
     fused, apply = ops.CudaLosses(launcher), loss_operations._Fused
-    comparing = partial(fused._photometric, expected=(0.8, -0.2, 0.0), wanted=True)
+    comparing = partial(fused._photometric, expected=(0.8, -0.2, 0.0), grad=True)
     there_and_back(apply, (False, True, False, False, False), comparing, image, rand(24, 40, 3), mask, None)
     for form, weights in ((False, None), (True, plane)):
         how = NormalOptions(camera, mask, weights, form, form)
-        bending = partial(fused._normal_consistency, how=how, expected=1.0, wanted=True)
+        bending = partial(fused._normal_consistency, how=how, expected=1.0, grad=True)
         there_and_back(apply, (False, True, True, True), bending, image, plane, plane)
     there_and_back(apply, (False, True, False), fused._masked_mean, plane, mask)
     cuda_passes.errors(launcher, view, splats, image, mask)

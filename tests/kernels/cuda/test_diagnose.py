@@ -52,7 +52,7 @@ MENDING = (
     ({f"{DIAGNOSE}.driver_version": says((12, 4))}, "driver supports CUDA 12.4, but torch needs CUDA 13.0; update"),
     ({"torch.version.cuda": "12.8"}, "driver supports CUDA 12.4, but NVRTC needs CUDA 13.0; update"),
     ({f"{DIAGNOSE}.nvrtc.nvrtc_version": says((12, 9))}, "torch sees no CUDA device.*; .*CUDA_VISIBLE_DEVICES"),
-    ({f"{DIAGNOSE}.seen_devices": says(H200)}, "NVIDIA H200: the GPU is too old; use --backend cpu"),
+    ({f"{DIAGNOSE}.visible_devices": says(H200)}, "NVIDIA H200: the GPU is too old; use --backend cpu"),
 )
 
 

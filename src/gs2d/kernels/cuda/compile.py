@@ -45,12 +45,12 @@ class Cubin:
 def sources() -> dict[str, str]:
     """Return all sources by their name in includes (``core/base.h``, ``cuda/project.cu``)."""
     root = resources.files("gs2d.kernels")
-    found = {}
+    texts = {}
     for folder in ("core", "cuda"):
         for entry in sorted(root.joinpath(folder).iterdir(), key=lambda e: e.name):
             if entry.name.endswith((".h", ".cu")):
-                found[f"{folder}/{entry.name}"] = entry.read_text(encoding="utf-8")
-    return found
+                texts[f"{folder}/{entry.name}"] = entry.read_text(encoding="utf-8")
+    return texts
 
 
 def source_names() -> tuple[str, ...]:
@@ -90,37 +90,37 @@ def architecture_for(capability: tuple[int, int]) -> str:
     """Return the architecture to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
 
     A device newer than the compiler runs code for an older one of the same major version. For a newer major version the
-    result is PTX of the newest known architecture, such as ``"compute_120"``, which the driver translates. Without a
-    compiler it is an architecture that the cache may hold. Raises BackendError if no architecture fits the device.
+    result is PTX of the newest supported architecture, such as ``"compute_120"``, which the driver translates. Without
+    a compiler it is an architecture that the cache may hold. Raises BackendError if no architecture fits the device.
     """
     if capability < MIN_CAPABILITY:
         raise BackendError(
             f"the GPU must have compute capability 7.5 or more (Turing, 2018), got {capability[0]}.{capability[1]}; "
             "use --backend cpu"
         )
-    known = _known_architectures()
-    wanted = 10 * capability[0] + capability[1]
-    older = [arch for arch in known if arch <= wanted and (arch == wanted or arch not in INTEGRATED)]
-    fitting = [arch for arch in older if arch // 10 == wanted // 10]
+    supported = _supported_architectures()
+    exact = 10 * capability[0] + capability[1]
+    older = [arch for arch in supported if arch <= exact and (arch == exact or arch not in INTEGRATED)]
+    fitting = [arch for arch in older if arch // 10 == exact // 10]
     if fitting:
         return f"sm_{max(fitting)}"
     if not older:
         raise BackendError(
-            f"the CUDA compiler knows architectures from sm_{min(known)}, the GPU has compute capability "
+            f"the CUDA compiler knows architectures from sm_{min(supported)}, the GPU has compute capability "
             f"{capability[0]}.{capability[1]}; install the NVRTC of torch's CUDA version"
         )
     return f"compute_{max(older)}"
 
 
-def _known_architectures() -> list[int]:
-    """Return the architectures that the compiler knows; without a compiler, ``ARCHITECTURES``."""
+def _supported_architectures() -> list[int]:
+    """Return the architectures that the compiler supports; without a compiler, ``ARCHITECTURES``."""
     try:
         nvrtc = _nvrtc()
     except BackendError:
         return [int(arch.removeprefix("sm_")) for arch in ARCHITECTURES]
-    status, known = nvrtc.nvrtcGetSupportedArchs()
+    status, supported = nvrtc.nvrtcGetSupportedArchs()
     _check(nvrtc, status, "nvrtcGetSupportedArchs")
-    return [int(arch) for arch in known]
+    return [int(arch) for arch in supported]
 
 
 def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
@@ -154,8 +154,8 @@ def compile_text(
     )
     _check(nvrtc, status, "nvrtcCreateProgram")
     try:
-        given = [f"--gpu-architecture={arch}".encode(), *(option.encode() for option in options)]
-        (status,) = nvrtc.nvrtcCompileProgram(program, len(given), given)
+        flags = [f"--gpu-architecture={arch}".encode(), *(option.encode() for option in options)]
+        (status,) = nvrtc.nvrtcCompileProgram(program, len(flags), flags)
         log = _bytes(nvrtc, program, "ProgramLog").decode(errors="replace").rstrip("\0")
         if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
             first = next((line for line in log.splitlines() if "error" in line), status.name)
@@ -220,10 +220,10 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
     code = None if path is None else _read(path)
     if code is not None:
         return Cubin(code, "")
-    made = compile_source(name, arch)
+    compiled = compile_source(name, arch)
     if path is not None:
-        _write(path, made.code)
-    return made
+        _write(path, compiled.code)
+    return compiled
 
 
 def _read(path: Path) -> bytes | None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.kernel_arguments import THREADS, arguments_of
-from gs2d.kernels.loss_operations import Kept, LossOperations, NormalOptions, Vjp
+from gs2d.kernels.loss_operations import LossOperations, NormalOptions, Saved, Vjp
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
@@ -38,8 +38,8 @@ def ready(**tensors: Tensor | None) -> list[Any]:
     return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors.values()]
 
 
-def _cotangent(given: Tensor | None) -> Tensor | None:
-    return None if given is None else given.detach().to(torch.float32).contiguous()
+def _cotangent(gradient: Tensor | None) -> Tensor | None:
+    return None if gradient is None else gradient.detach().to(torch.float32).contiguous()
 
 
 def strips(height: int, width: int) -> int:
@@ -75,50 +75,50 @@ class CudaLosses(LossOperations):
         return means
 
     def _photometric(
-        self, *images: Tensor | None, expected: tuple[float, float, float], wanted: bool
-    ) -> tuple[tuple[Tensor, Tensor, Tensor], Kept, Vjp]:
+        self, *images: Tensor | None, expected: tuple[float, float, float], grad: bool
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Saved, Vjp]:
         rendered: Any = images[0]
         height, width = rendered.shape[:2]
         blocks = strips(height, width)
         partials = rendered.new_empty(4, blocks)
-        maps = rendered.new_empty(3, height, width, 3) if wanted else None
-        given, size = (
+        maps = rendered.new_empty(3, height, width, 3) if grad else None
+        tensors, size = (
             dict(zip(("rendered", "target", "mask"), images, strict=False)),
             {"height": height, "width": width},
         )
-        self._launch("photometric_forward", blocks, given, size, maps=maps, partials=partials)
+        self._launch("photometric_forward", blocks, tensors, size, maps=maps, partials=partials)
         means = self._finish(partials)
 
-        def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], *cotangents: Tensor | None) -> Kept:
-            gradient, (maps, means) = torch.empty_like(images[0]), kept
-            found = dict(zip(("rendered", "target", "mask"), images, strict=False))
-            found |= dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, cotangents), strict=True))
-            self._launch("photometric_vjp", blocks, size, found, maps=maps, means=means, gradient=gradient)
+        def vjp(images: Sequence[Any], saved: Saved, needed: Sequence[bool], *cotangents: Tensor | None) -> Saved:
+            gradient, (maps, means) = torch.empty_like(images[0]), saved
+            inputs = dict(zip(("rendered", "target", "mask"), images, strict=False))
+            inputs |= dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, cotangents), strict=True))
+            self._launch("photometric_vjp", blocks, size, inputs, maps=maps, means=means, gradient=gradient)
             return (gradient,)
 
         return (means[1].clone(), means[2].clone(), means[3].clone()), (maps, means), vjp
 
     def _normal_consistency(
-        self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, wanted: bool
-    ) -> tuple[Tensor, Kept, Vjp]:
-        blocks, given = -(-depth.numel() // MEAN_PIXELS), _normal_inputs(how)
+        self, normal: Tensor, depth: Tensor, alpha: Tensor, *, how: NormalOptions, expected: float, grad: bool
+    ) -> tuple[Tensor, Saved, Vjp]:
+        blocks, options = -(-depth.numel() // MEAN_PIXELS), _normal_inputs(how)
         partials = depth.new_empty(2, blocks)
-        self._launch("normal_consistency", blocks, given, normal=normal, depth=depth, alpha=alpha, partials=partials)
+        self._launch("normal_consistency", blocks, options, normal=normal, depth=depth, alpha=alpha, partials=partials)
         means = self._finish(partials, complement=not how.per_splat and how.weights is None)
 
-        def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], cotangent: Tensor) -> Kept:
-            want = [*needed[:2], needed[2] and how.per_splat]
-            gradients = [torch.empty_like(x) if w else None for x, w in zip(images, want, strict=True)]
+        def vjp(images: Sequence[Any], saved: Saved, needed: Sequence[bool], cotangent: Tensor) -> Saved:
+            mask = [*needed[:2], needed[2] and how.per_splat]
+            gradients = [torch.empty_like(x) if w else None for x, w in zip(images, mask, strict=True)]
             tiles = -(-how.camera.width // NORMAL_W) * -(-how.camera.height // NORMAL_H)
             inputs = dict(zip(("normal", "depth", "alpha"), images, strict=True))
             outputs = dict(zip(("g_normal", "g_depth", "g_alpha"), gradients, strict=True))
-            outputs |= {"means": kept[0], "cotangent": _cotangent(cotangent)}
-            self._launch("normal_consistency_vjp", tiles, given, inputs, outputs)
+            outputs |= {"means": saved[0], "cotangent": _cotangent(cotangent)}
+            self._launch("normal_consistency_vjp", tiles, options, inputs, outputs)
             return gradients
 
         return means[1].clone(), [means], vjp
 
-    def _normal_smoothness(self, *images: Tensor | None, expected: float, wanted: bool) -> tuple[Tensor, Kept, Vjp]:
+    def _normal_smoothness(self, *images: Tensor | None, expected: float, grad: bool) -> tuple[Tensor, Saved, Vjp]:
         normal: Any = images[0]
         height, width = normal.shape[:2]
         blocks, size = -(-height * width // MEAN_PIXELS), {"height": height, "width": width}
@@ -126,24 +126,24 @@ class CudaLosses(LossOperations):
         self._launch("normal_smoothness", blocks, size, dict(zip(names, images, strict=True)), partials=partials)
         means = self._finish(partials)
 
-        def vjp(images: Sequence[Any], kept: Kept, needed: Sequence[bool], cotangent: Tensor) -> Kept:
+        def vjp(images: Sequence[Any], saved: Saved, needed: Sequence[bool], cotangent: Tensor) -> Saved:
             gradient = torch.empty_like(images[0])
-            found = {"means": kept[0], "cotangent": _cotangent(cotangent), "g_normal": gradient}
-            self._launch("normal_smoothness", blocks, size, dict(zip(names, images, strict=True)), found)
+            outputs = {"means": saved[0], "cotangent": _cotangent(cotangent), "g_normal": gradient}
+            self._launch("normal_smoothness", blocks, size, dict(zip(names, images, strict=True)), outputs)
             return (gradient,)
 
         return means[1].clone(), [means], vjp
 
-    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Kept, Vjp]:
+    def _masked_mean(self, values: Tensor, mask: Tensor | None) -> tuple[Tensor, Saved, Vjp]:
         blocks = -(-values.numel() // MEAN_PIXELS)
         partials = values.new_empty(2, blocks)
         height, width = values.shape
-        given = {"values": values, "mask": mask, "partials": partials}
-        self._launch("masked_mean", blocks, given, height=height, width=width)
+        inputs = {"values": values, "mask": mask, "partials": partials}
+        self._launch("masked_mean", blocks, inputs, height=height, width=width)
         means = self._finish(partials)
 
-        def vjp(tensors: Sequence[Any], kept: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Kept:
-            (values, mask), (means,) = tensors, kept
+        def vjp(tensors: Sequence[Any], saved: Sequence[Any], needed: Sequence[bool], cotangent: Tensor) -> Saved:
+            (values, mask), (means,) = tensors, saved
             each = cotangent * means[0]
             return (each.expand_as(values) if mask is None else mask * each,)
 

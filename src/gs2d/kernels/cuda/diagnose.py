@@ -42,7 +42,7 @@ def machine() -> str:
                 f"the driver supports CUDA {dotted(supported)}, but {name} needs CUDA {dotted(needs)}; {OLD_DRIVER}, "
                 f"{ANYWAY}"
             )
-    devices = seen_devices()
+    devices = visible_devices()
     if own_default_stream():
         raise BackendError(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it; unset it")
     try:
@@ -71,16 +71,16 @@ def cache_words() -> str:
     return f"; {where}: kernels are compiled at every start"
 
 
-def seen_devices() -> list[tuple[str, tuple[int, int]]]:
+def visible_devices() -> list[tuple[str, tuple[int, int]]]:
     """Return name and compute capability of the devices visible to torch, the current one first.
 
     Raises BackendError with torch's warning if there is none.
     """
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         usable = torch.cuda.is_available()
     if not usable:
-        warning = f" ({str(said[0].message).splitlines()[0]})" if said else ""
+        warning = f" ({str(caught[0].message).splitlines()[0]})" if caught else ""
         raise BackendError(f"torch sees no CUDA device{warning}; check `nvidia-smi` and CUDA_VISIBLE_DEVICES, {ANYWAY}")
     first = torch.cuda.current_device()
     order = sorted(range(torch.cuda.device_count()), key=lambda index: index != first)

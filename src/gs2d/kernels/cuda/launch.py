@@ -132,23 +132,23 @@ class GpuLauncher:
     def _graph_of(self, works: Sequence[Work]) -> Graph | None:
         """Return the updated graph of these launches; None if they were not repeated enough or graphs fail."""
         names = tuple([work.name for work in works])
-        known = self._graphs.get(names, 0)
-        if isinstance(known, int) and known + 1 < GRAPHS_FROM:
-            self._graphs[names] = known + 1
+        graph = self._graphs.get(names, 0)
+        if isinstance(graph, int) and graph + 1 < GRAPHS_FROM:
+            self._graphs[names] = graph + 1
             return None
         try:
-            if isinstance(known, int):
+            if isinstance(graph, int):
                 if len(self._graphs) > MAX_GRAPHS:
                     self._graphs.clear()
                 kernels = [self._functions.get(name) or self._load(name) for name in names]
-                known = self._graphs[names] = Graph(self._driver, kernels, works)
+                graph = self._graphs[names] = Graph(self._driver, kernels, works)
             else:
-                known.change(works)
+                graph.change(works)
         except BackendError:  # too little memory: launch one by one
             self._replays = False
             self._graphs.clear()
             return None
-        return known
+        return graph
 
     @contextmanager
     def _in_context(self) -> Iterator[None]:
