@@ -115,7 +115,7 @@ class OperationCount(TorchDispatchMode):
 
 
 def _nothing_overflowed(budget: pair_budget.PairBudget) -> bool:
-    budget._asked.clear()
+    budget._pending.clear()
     budget.overflow = None
     return False
 

@@ -452,8 +452,8 @@ def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> Rast
 def check_settings(s: RasterSettings) -> None:
     """Raise ShapeError for invalid settings."""
 
-    def require(holds: bool, field: str, rule: str) -> None:
-        if not holds:
+    def require(condition: bool, field: str, rule: str) -> None:
+        if not condition:
             raise ShapeError(f"RasterSettings.{field} must be {rule}, got {getattr(s, field)!r}")
 
     require(math.isfinite(s.near) and s.near > 0, "near", "positive")

@@ -229,11 +229,11 @@ class Backend:
     def status(cls) -> BackendStatus:
         """Return the line for ``gs2d doctor``."""
         try:
-            made = cls.ready()
+            backend = cls.ready()
         except BackendError as error:
             reason, _, remedy = str(error).partition("; ")
             return BackendStatus(cls.name, False, reason, remedy, "")
-        return BackendStatus(cls.name, True, "", "", made.about or cls.__module__)
+        return BackendStatus(cls.name, True, "", "", backend.about or cls.__module__)
 
 
 def get_backend(name: str, device: str | None = None) -> Backend:

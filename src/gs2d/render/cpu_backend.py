@@ -74,27 +74,27 @@ class CpuBackend(KernelBackend):
             images["color"] = with_features(frame, images["color"], features)
         return images, {}, frame
 
-    def backward_pass(self, state: Frame, given: Gradients) -> None:
+    def backward_pass(self, state: Frame, grads: Gradients) -> None:
         """Compute gradients of the last forward pass; the work for other rows is skipped."""
-        saved, wanted, probe = given.saved, given.wanted, given.wanted["probe"]
+        saved, outputs, probe = grads.saved, grads.outputs, grads.outputs["probe"]
         images = Images(*(address_of(saved[name]) for name in (*IMAGES, "radii")))
-        upstream = ImageGradients(*(address_of(given.upstream.get(name)) for name in (*IMAGES, "depth_transmittance")))
-        outputs = (address_of(wanted[name]) for name in (*ATTRIBUTES, "probe"))
-        out = ParameterGradients(*outputs, 0 if probe is None else probe.shape[1], address_of(given.rows))
-        arguments = (state.pointer, parameters_of(saved), images, upstream, out, wanted["intrinsics"])
-        if given.wide is None:
+        upstream = ImageGradients(*(address_of(grads.upstream.get(name)) for name in (*IMAGES, "depth_transmittance")))
+        addresses = (address_of(outputs[name]) for name in (*ATTRIBUTES, "probe"))
+        out = ParameterGradients(*addresses, 0 if probe is None else probe.shape[1], address_of(grads.rows))
+        arguments = (state.pointer, parameters_of(saved), images, upstream, out, outputs["intrinsics"])
+        if grads.wide is None:
             run(state.library, "gs2d_raster_backward_intrinsics", *arguments)
             return
-        tensors = (saved["values"], saved["background"], *given.wide, wanted["values"])
+        tensors = (saved["values"], saved["background"], *grads.wide, outputs["values"])
         channels = Channels(saved["values"].shape[1], *map(address_of, tensors))
         run(state.library, "gs2d_raster_backward_features", *arguments, channels)
 
     def errors_pass(self, scene: ViewOfSplats, image: Tensor, mask: Tensor | None, occlusion: bool) -> Tensor:
         """Return the splat errors [N] of one view."""
-        found = torch.empty(len(scene.splats["means"]), dtype=self.dtype)
+        errors = torch.empty(len(scene.splats["means"]), dtype=self.dtype)
         view = view_of(scene.camera, scene.settings, self._exact_masks)
-        run(self._library(), "gs2d_splat_errors", view, parameters_of(scene.splats), image, mask, occlusion, found)
-        return found
+        run(self._library(), "gs2d_splat_errors", view, parameters_of(scene.splats), image, mask, occlusion, errors)
+        return errors
 
     def cache_view(
         self, splats: Splats, camera: Camera, settings: RasterSettings, rows: Tensor, *, limit_bytes: int

@@ -84,8 +84,8 @@ class _Render(torch.autograd.Function):
         sh0_gradient, shN_gradient = colors.new_empty(view.rows, 1, 3), torch.empty_like(shN)
         slots = colors.new_empty(len(view.arrays["entry_row"]), 4)
         out = filled(ParameterGradients, sh0=sh0_gradient, shN=shN_gradient)
-        given = (view.native, upstream.contiguous(), colors, shN.shape[1], slots, out)
-        view.library.call("gs2d_cached_gradients", *given)
+        arguments = (view.native, upstream.contiguous(), colors, shN.shape[1], slots, out)
+        view.library.call("gs2d_cached_gradients", *arguments)
         return None, sh0_gradient, shN_gradient
 
 
@@ -122,8 +122,8 @@ def cache_view(
         "frozen": ((tiles, 3, TILE * TILE), library.dtype),
         "basis": ((-(-count // library.lanes), SH_MAX, library.lanes), library.dtype),
     }
-    wanted = sum(torch.Size(shape).numel() * dtype.itemsize for shape, dtype in sizes.values())
-    if wanted + tile_entries.nbytes + tile_blocks.nbytes > limit_bytes:
+    nbytes = sum(torch.Size(shape).numel() * dtype.itemsize for shape, dtype in sizes.values())
+    if nbytes + tile_entries.nbytes + tile_blocks.nbytes > limit_bytes:
         return None
     arrays = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in sizes.items()}
     arrays |= {"tile_entries": tile_entries, "tile_blocks": tile_blocks}

@@ -63,7 +63,7 @@ class CudaBackend(KernelBackend):
         exact_masks: bool = True,
         deterministic: bool | None = None,
     ) -> None:
-        self._budget, self._given = budget, launcher
+        self._budget, self._fixed = budget, launcher
         self._exact_masks, self._deterministic = exact_masks, deterministic
         self._last: tuple[Callable[[], Any], Callable[[], None]] | None = None  # the iteration that may be repeated
         self._stepper: Stepper | None = None
@@ -76,7 +76,7 @@ class CudaBackend(KernelBackend):
         return ready
 
     def _launcher(self, device: torch.device) -> Launcher:
-        return self._given or launch.launcher_for(device)
+        return self._fixed or launch.launcher_for(device)
 
     def forward_pass(
         self, scene: ViewOfSplats, features: Features | None
@@ -104,26 +104,26 @@ class CudaBackend(KernelBackend):
             outputs["color"] = torch.cat([outputs["color"], further], dim=2)
         return outputs, hidden, (launcher, frame.view, sure)
 
-    def backward_pass(self, state: Any, given: Gradients) -> None:
+    def backward_pass(self, state: Any, grads: Gradients) -> None:
         """Compute gradients of a forward pass; if only colours have some, a shorter pass runs.
 
         They are summed by atomic additions, so on a GPU their last digits vary from run to run, unless
         ``deterministic``.
         """
         launcher, view, sure = state
-        saved, wanted, further, to_values = given.saved, dict(given.wanted), None, None
+        saved, outputs, further, to_values = grads.saved, dict(grads.outputs), None, None
         splats = {name: saved[name] for name in ATTRIBUTES}
         images = {name: saved[name] for name in (*IMAGES, *HIDDEN)}
         frame = ForwardState(view=view, images=images, radii=saved["radii"], **{name: saved[name] for name in SAVED})
-        upstream: dict[str, Tensor | None] = dict.fromkeys((*IMAGES, "depth_transmittance")) | dict(given.upstream)
+        upstream: dict[str, Tensor | None] = dict.fromkeys((*IMAGES, "depth_transmittance")) | dict(grads.upstream)
         if len(saved["moments"]) == 0:
             upstream["distortion"] = None  # a constant
-        values = wanted.pop("values")
-        if given.wide is not None:
-            further, to_values = _further(saved, given.wide)
-        if wanted["intrinsics"] is not None:
-            wanted["intrinsics"].zero_()
-        backward(launcher, frame, splats, upstream, wanted, learns=given.rows, deterministic=sure, features=further)
+        values = outputs.pop("values")
+        if grads.wide is not None:
+            further, to_values = _further(saved, grads.wide)
+        if outputs["intrinsics"] is not None:
+            outputs["intrinsics"].zero_()
+        backward(launcher, frame, splats, upstream, outputs, learns=grads.rows, deterministic=sure, features=further)
         if values is not None and to_values is not None:
             values.copy_(to_values[:, : values.shape[1]])
 
@@ -148,7 +148,7 @@ class CudaBackend(KernelBackend):
         """Return a backend with a budget; torch's memory segments may grow from now on."""
         launch.grow_in_place()
         return type(self)(
-            PairBudget(), launcher=self._given, exact_masks=self._exact_masks, deterministic=self._deterministic
+            PairBudget(), launcher=self._fixed, exact_masks=self._exact_masks, deterministic=self._deterministic
         )
 
     def iterate(self, update: Callable[[], T], *, rollback: Callable[[], None], exact: bool) -> T:

@@ -29,7 +29,7 @@ from gs2d.render.cuda_works import (
     piece_buffers,
     piece_words,
     project,
-    see,
+    set_view,
     splat_gradients,
     takes_view,
 )
@@ -107,7 +107,7 @@ def view_of(camera: Camera, settings: RasterSettings) -> ctypes.Structure:
 def _run(launcher: Launcher, view: ctypes.Structure, work: Work) -> None:
     """Run a launch for a view."""
     if takes_view(work):
-        see([work], view)
+        set_view([work], view)
     launcher.launch(work.name, work.blocks, work.threads, work.arguments)
 
 
@@ -151,16 +151,16 @@ def forward(
         return torch.empty(shape, dtype=torch.float32, device=device)
 
     projected = _project(launcher, view, splats, errors=False, exact=exact)
-    found = _bin(launcher, view, projected, exact, budget, whole_lists=whole_lists)
-    words = (len(found["entries"]) >> 5) + len(found["tiles"]) + 1
-    found |= {"records": projected["records"], "seen": torch.empty(words, 8, dtype=torch.int32, device=device)}
-    H, W, tiles = int(view.height), int(view.width), len(found["tiles"])
+    binned = _bin(launcher, view, projected, exact, budget, whole_lists=whole_lists)
+    words = (len(binned["entries"]) >> 5) + len(binned["tiles"]) + 1
+    binned |= {"records": projected["records"], "seen": torch.empty(words, 8, dtype=torch.int32, device=device)}
+    H, W, tiles = int(view.height), int(view.width), len(binned["tiles"])
     images = {name: floats(H, W, 3) if name in ("color", "normal") else floats(H, W) for name in IMAGES}
     images |= {"final_T": floats(H, W), "moments": floats(H, W, 3) if distortion else floats(0)}
     if not distortion:
         images["distortion"].fill_(math.nan)
-    lists = {name: found[name] for name in LISTS}
-    pieces = piece_buffers(found["pieces"], len(found["pieces"]))
+    lists = {name: binned[name] for name in LISTS}
+    pieces = piece_buffers(binned["pieces"], len(binned["pieces"]))
     for work in blend(tiles, lists, images, pieces, distortion=distortion):
         _run(launcher, view, work)
     images |= {name: floats(H, W) if transmittance else floats(0) for name in DEPTH}
@@ -168,8 +168,8 @@ def forward(
         more = {"alpha": images["alpha"], "median": images["depth_median"], "slope": images["slope"]}
         more |= {"depth": images["depth_transmittance"]}
         _run(launcher, view, work_of("transmittance_depth", tiles, lists, more))
-    kept = {name: projected[name] for name in ("tile_counts", "radii")}
-    return ForwardState(view=view, images=images, **found, **kept)
+    per_splat = {name: projected[name] for name in ("tile_counts", "radii")}
+    return ForwardState(view=view, images=images, **binned, **per_splat)
 
 
 def _features(
@@ -217,14 +217,14 @@ def _bin(
         bits = 16 if tiles < 1 << 15 else 32  # the sentinel is `tiles`
         keys = torch.empty(candidates, dtype=torch.int16 if bits == 16 else torch.int32, device=device)
         payloads = torch.empty(candidates, dtype=torch.int32, device=device)
-        given = {name: projected[name] for name in ("cull", "records", "rects")}
-        given |= {"order": order, "ends": ends, "keys": keys, "payloads": payloads}
+        inputs = {name: projected[name] for name in ("cull", "records", "rects")}
+        inputs |= {"order": order, "ends": ends, "keys": keys, "payloads": payloads}
         sizes = {"candidates": candidates, "visible": len(order), "exact": int(exact)}
-        _run(launcher, view, work_of(f"emit_entries_{bits}", blocks_of(candidates), given, sizes))
+        _run(launcher, view, work_of(f"emit_entries_{bits}", blocks_of(candidates), inputs, sizes))
         sorted_keys, permutation = torch.sort(keys, stable=True)
-        given = {"keys": sorted_keys, "permutation": permutation, "payloads": payloads}
-        given |= {"entries": entries, "ranges": ranges}
-        _run(launcher, view, work_of(f"find_ranges_{bits}", blocks_of(candidates), given, candidates=candidates))
+        inputs = {"keys": sorted_keys, "permutation": permutation, "payloads": payloads}
+        inputs |= {"entries": entries, "ranges": ranges}
+        _run(launcher, view, work_of(f"find_ranges_{bits}", blocks_of(candidates), inputs, candidates=candidates))
     heavy_first = torch.empty(tiles, dtype=torch.int32, device=device)
     words = piece_words(0 if whole_lists else candidates)
     pieces = torch.empty(words, dtype=torch.float32, device=device)
@@ -238,7 +238,7 @@ def backward(
     frame: ForwardState,
     splats: Mapping[str, Tensor],
     upstream: Mapping[str, Tensor | None],
-    wanted: Mapping[str, Tensor | None],
+    outputs: Mapping[str, Tensor | None],
     *,
     learns: Tensor | None = None,
     deterministic: bool = False,
@@ -246,7 +246,7 @@ def backward(
 ) -> None:
     """Compute gradients.
 
-    ``upstream`` are the gradients of the images by name. ``wanted`` are the output tensors by name of the parameter,
+    ``upstream`` are the gradients of the images by name. ``outputs`` are the output tensors by name of the parameter,
     "probe" and "intrinsics" [N, 4]; None is not computed. Splats outside of ``learns`` [N] bool get zeros.
     ``deterministic`` sums without atomics: 320 bytes for each pair of splat and tile, and one more pass.
 
@@ -257,14 +257,14 @@ def backward(
     if len(splats["means"]) == 0:
         return
     only_colors = features is None and all(
-        tensor is None for name, tensor in wanted.items() if name not in ("sh0", "shN")
+        tensor is None for name, tensor in outputs.items() if name not in ("sh0", "shN")
     )
     if only_colors and upstream["color"] is None:
-        for tensor in wanted.values():
+        for tensor in outputs.values():
             if tensor is not None:
                 tensor.zero_()
         return
-    probe = wanted["probe"]
+    probe = outputs["probe"]
     sums = _Sums(frame, deterministic, columns=0 if only_colors else 16)
     further = None
     if features is not None:
@@ -282,8 +282,8 @@ def backward(
     )
     _run(launcher, frame.view, blended)
     gradients, extras = sums.of_splats(launcher)
-    given = {"tile_counts": frame.tile_counts, "learns": learns, "gradients": gradients, "extras": extras}
-    _run(launcher, frame.view, splat_gradients(splats, given, wanted))
+    inputs = {"tile_counts": frame.tile_counts, "learns": learns, "gradients": gradients, "extras": extras}
+    _run(launcher, frame.view, splat_gradients(splats, inputs, outputs))
 
 
 class _Sums:
@@ -319,13 +319,13 @@ class _Sums:
         count = len(self.frame.records)
         extras = self.extras.new_empty(count, 4)
         gradients = None if self.gradients is None else self.gradients.new_empty(count, self.gradients.shape[1])
-        given = {"order": self.frame.order, "ends": self.frame.ends, "gradients": gradients, "extras": extras}
+        inputs = {"order": self.frame.order, "ends": self.frame.ends, "gradients": gradients, "extras": extras}
         sizes = {"count": count, "candidates": len(self.slots)}
         slots = {"slots": self.gradients, "extra_slots": self.extras}
         if self._features is not None:
-            slots["feature_slots"], given["features"] = self._features
+            slots["feature_slots"], inputs["features"] = self._features
             sizes["channels"] = self._features[1].shape[1]
-        _run(launcher, self.frame.view, work_of("sum_slots", blocks_of(32 * count), sizes, given, slots))
+        _run(launcher, self.frame.view, work_of("sum_slots", blocks_of(32 * count), sizes, inputs, slots))
         return gradients, extras
 
 
@@ -342,15 +342,15 @@ def errors(
     projected = _project(launcher, view, splats, errors=True)
     if count == 0:
         return torch.empty(0, dtype=torch.float32, device=image.device)
-    given: dict[str, Tensor | None] = {"image": image, "mask": mask}
+    inputs: dict[str, Tensor | None] = {"image": image, "mask": mask}
     if occlusion:
         lists = _bin(launcher, view, projected, True, whole_lists=True)
         units = torch.zeros(count, dtype=torch.int64, device=image.device)
-        given |= {name: lists[name] for name in ("entries", "ranges", "tiles")}
-        given |= {"records": projected["records"], "errors": units}
-        _run(launcher, view, work_of("splat_errors_occluded", len(lists["tiles"]), given))
+        inputs |= {name: lists[name] for name in ("entries", "ranges", "tiles")}
+        inputs |= {"records": projected["records"], "errors": units}
+        _run(launcher, view, work_of("splat_errors_occluded", len(lists["tiles"]), inputs))
         return (units.to(torch.float64) * ERROR_UNIT).to(torch.float32)
     total = torch.empty(count, dtype=torch.float32, device=image.device)
-    given |= {name: projected[name] for name in ("records", "cull", "rects", "tile_counts")} | {"errors": total}
-    _run(launcher, view, work_of("splat_errors", blocks_of(32 * count), given, count=count))
+    inputs |= {name: projected[name] for name in ("records", "cull", "rects", "tile_counts")} | {"errors": total}
+    _run(launcher, view, work_of("splat_errors", blocks_of(32 * count), inputs, count=count))
     return total

@@ -41,7 +41,7 @@ from gs2d.render.cuda_works import (
     piece_buffers,
     piece_words,
     project,
-    see,
+    set_view,
     splat_gradients,
     takes_view,
 )
@@ -61,7 +61,7 @@ class Arena:
     def __init__(self, device: torch.device) -> None:
         self.generation = 0  # incremented when a tensor moves, which invalidates addresses
         self._device = device
-        self._held: dict[str, Tensor] = {}
+        self._tensors: dict[str, Tensor] = {}
 
     def get(
         self, name: str, count: int, dtype: torch.dtype = torch.float32, *, zeros: bool = False, spare: float = SPARE
@@ -70,17 +70,17 @@ class Arena:
 
         With ``zeros`` new memory is zero, and users reset it to zero.
         """
-        held = self._held.get(name)
-        if held is None or len(held) < count:
+        tensor = self._tensors.get(name)
+        if tensor is None or len(tensor) < count:
             make: Callable[..., Tensor] = torch.zeros if zeros else torch.empty
-            held = self._held[name] = make(math.ceil(spare * count), dtype=dtype, device=self._device)
+            tensor = self._tensors[name] = make(math.ceil(spare * count), dtype=dtype, device=self._device)
             self.generation += 1
-        return held
+        return tensor
 
     def release(self) -> None:
         """Free all memory."""
-        if self._held:
-            self._held.clear()
+        if self._tensors:
+            self._tensors.clear()
             self.generation += 1
 
 
@@ -116,21 +116,21 @@ class Stepper:
         plan = self._plan_of(step, view, max(room, 1))
         budget.overflow = plan.overflow
         plan.set(step, view, max(room, 1), budget.expect(rendering, max(room, 1), self._device))
-        self._launcher.run(plan.until_known)
-        budget.asked(self._device)
+        self._launcher.run(plan.until_counted)
+        budget.record(self._device)
         self._launcher.run(plan.afterwards)
         return True
 
     def _view_of(self, step: WholeStep) -> ctypes.Structure:
         """Return the structure of a camera; cached, since cameras recur."""
         key = id(step.camera), id(step.settings)
-        known = self._views.get(key)
-        if known is None:
+        entry = self._views.get(key)
+        if entry is None:
             if len(self._views) >= MOST_VIEWS:
                 self._views.clear()
             # Keep the objects, so that their ids stay valid.
-            known = self._views[key] = step.camera, step.settings, view_of(step.camera, step.settings)
-        return known[2]
+            entry = self._views[key] = step.camera, step.settings, view_of(step.camera, step.settings)
+        return entry[2]
 
     def _plan_of(self, step: WholeStep, view: ctypes.Structure, room: int) -> _Plan:
         """Return the launches of such an iteration, with all constant arguments filled."""
@@ -255,10 +255,10 @@ class _Sorting:
 
     def running(self, tile_counts: Tensor, overflow: Tensor) -> Work:
         """Compute the running sums of pairs in depth order, their total, and whether it exceeds the room."""
-        given = {"order": self.order, "tile_counts": tile_counts, "ends": self.ends, "overflow": overflow}
+        inputs = {"order": self.order, "tile_counts": tile_counts, "ends": self.ends, "overflow": overflow}
         scratch = {"ticket": self.part("tickets", 2 * MOST_PASSES), "words": self.part("running")}
         blocks = pieces_of(self._count)
-        self._running = work_of("running_counts", blocks, given, scratch, threads=SORT_THREADS, count=self._count)
+        self._running = work_of("running_counts", blocks, inputs, scratch, threads=SORT_THREADS, count=self._count)
         return self._running
 
     def by_tile(self) -> list[Work]:
@@ -297,23 +297,23 @@ class _Losses:
             one.photograph.background[:] = step.background
         self.works = [first, second]
         self._normals = self._smooth = self._silhouette = None
-        wanted = step.losses.normals
-        if wanted is not None and "normal" in upstream:
-            depth = f"depth_{wanted.depth}"
-            given = {"normal": images["normal"], "depth": images[depth], "alpha": images["alpha"]}
-            given |= {"g_normal": upstream["normal"], "g_depth": upstream[depth]}
-            if wanted.of_object and channels == 3:
-                given["weights"] = images["alpha"]
+        options = step.losses.normals
+        if options is not None and "normal" in upstream:
+            depth = f"depth_{options.depth}"
+            named = {"normal": images["normal"], "depth": images[depth], "alpha": images["alpha"]}
+            named |= {"g_normal": upstream["normal"], "g_depth": upstream[depth]}
+            if options.of_object and channels == 3:
+                named["weights"] = images["alpha"]
             tiles = -(-width // NORMAL_W) * -(-height // NORMAL_H)
-            at_camera = int(wanted.at_camera)
-            self._normals = self._add("normal_consistency_vjp", tiles, given, size, at_camera=at_camera)
+            at_camera = int(options.at_camera)
+            self._normals = self._add("normal_consistency_vjp", tiles, named, size, at_camera=at_camera)
         if step.losses.smooth_normals and "normal" in upstream:
-            given = {"normal": images["normal"], "alpha": images["alpha"], "g_normal": upstream["normal"]}
+            named = {"normal": images["normal"], "alpha": images["alpha"], "g_normal": upstream["normal"]}
             blocks = -(-height * width // MEAN_PIXELS)
-            self._smooth = self._add("normal_smoothness", blocks, given, size, adds=1)  # to those of normal consistency
+            self._smooth = self._add("normal_smoothness", blocks, named, size, adds=1)  # to those of normal consistency
         if "alpha" in upstream:
-            given, pixels = {"alpha": images["alpha"], "g_alpha": upstream["alpha"]}, height * width
-            self._silhouette = self._add("silhouette_vjp", blocks_of(pixels), given, pixels=pixels)
+            named, pixels = {"alpha": images["alpha"], "g_alpha": upstream["alpha"]}, height * width
+            self._silhouette = self._add("silhouette_vjp", blocks_of(pixels), named, pixels=pixels)
 
     def _add(self, kernel: str, blocks: int, *named: Mapping[str, Any], **fields: Any) -> ctypes.Structure:
         """Append a launch and return its arguments."""
@@ -330,13 +330,13 @@ class _Losses:
         second.ssim_scale = -np.float32(step.losses.ssim) * one
         second.l2_scale = np.float32(step.losses.l2) * one
         if self._normals is not None:
-            normals, wanted = self._normals, step.losses.normals
-            assert wanted is not None
-            of_object = photograph if wanted.of_object and step.photograph.shape[2] == 4 else None
-            fill(normals, mask=mask, object=of_object, flatness=step.flatness, flat_more=np.float32(wanted.flat - 1))
+            normals, options = self._normals, step.losses.normals
+            assert options is not None
+            of_object = photograph if options.of_object and step.photograph.shape[2] == 4 else None
+            fill(normals, mask=mask, object=of_object, flatness=step.flatness, flat_more=np.float32(options.flat - 1))
             fill(normals, **{name: getattr(view.camera, name) for name in ("fx", "fy", "cx", "cy")})
             normals.rotation = view.camera.R
-            normals.scale = np.float32(wanted.weight) * np.float32(1 / max(step.valid, 1))
+            normals.scale = np.float32(options.weight) * np.float32(1 / max(step.valid, 1))
         if self._smooth is not None:
             assert step.flatness is not None
             scale = np.float32(step.losses.smooth_normals) * np.float32(1 / max(step.valid, 1))
@@ -356,7 +356,7 @@ class _Plan:
         projected = {name: arena.get(name, n * count, dtype) for name, (n, dtype) in PROJECTED.items()}
         by_depth = sorting.by_depth(projected["depth_keys"])
         running = sorting.running(projected["tile_counts"], self.overflow)
-        self.until_known = [sorting.clear(), project(splats, projected), *by_depth, running]
+        self.until_counted = [sorting.clear(), project(splats, projected), *by_depth, running]
 
         pointers = {name: projected[name] for name in ("cull", "records", "rects")}
         pointers |= {name: getattr(sorting, name) for name in ("order", "ends", "keys", "payloads")}
@@ -375,14 +375,14 @@ class _Plan:
         words = piece_words(sorting.most_room)
         pieces = piece_buffers(arena.get("pieces", words, spare=1), words)
         images, upstream = _images(arena, step)
-        kept = {name: images[name] for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "final_T")}
+        drawn = {name: images[name] for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "final_T")}
         self._losses = _Losses(step, images, upstream)
         self.afterwards = [
             self._of_room[0],
             *sorting.by_tile(),
             self._of_room[1],
             order_tiles(tiles, {"ranges": ranges, "order": heavy_first}, pieces),
-            *blend(tiles, lists, kept, pieces, distortion=False),
+            *blend(tiles, lists, drawn, pieces, distortion=False),
             *self._losses.works,
         ]
 
@@ -390,9 +390,9 @@ class _Plan:
         sums["extras"] = arena.get("extras", 4 * count, zeros=True)
         if not _only_colors(step):
             sums["gradients"] = arena.get("gradient_rows", 16 * count, zeros=True)
-        found = {"color": images["g_color"], **upstream}
+        to_images = {"color": images["g_color"], **upstream}
         gradients = {name: arena.get(f"g_{name}", splats[name].numel()) for name in step.learned}
-        blended = blend_gradients(tiles, lists, kept, found, sums, pieces, absolute="absolute" in step.gathered)
+        blended = blend_gradients(tiles, lists, drawn, to_images, sums, pieces, absolute="absolute" in step.gathered)
         last = splat_gradients(splats, sums | {"tile_counts": projected["tile_counts"]}, gradients, clears=True)
         if step.gathered and not _only_colors(step):
             names = {"signed_norms": "signed", "absolute_norms": "absolute", "counts": "count"}
@@ -406,7 +406,7 @@ class _Plan:
         ]
         self._adam = adam_work(updates, beta1=beta1, beta2=beta2, eps=eps, skip=self.overflow)
         self.afterwards += [blended, last, self._adam]
-        self._seeing = [work for work in (*self.until_known, *self.afterwards) if takes_view(work)]
+        self._view_works = [work for work in (*self.until_counted, *self.afterwards) if takes_view(work)]
 
     @property
     def most_room(self) -> int:
@@ -415,7 +415,7 @@ class _Plan:
 
     def set(self, step: WholeStep, view: ctypes.Structure, room: int, pairs: Tensor) -> None:
         """Write what differs between iterations: camera, photograph, room, address of the count, and rates."""
-        see(self._seeing, view)
+        set_view(self._view_works, view)
         for work in self._of_room:
             work.arguments.candidates, work.blocks = room, blocks_of(room)
         self._sorting.set(room, pairs)

@@ -34,7 +34,7 @@ def takes_view(work: Work) -> bool:
     return hasattr(work.arguments, "view") or isinstance(work.arguments, cuda_structure("EmitArguments"))
 
 
-def see(works: Iterable[Work], view: ctypes.Structure) -> None:
+def set_view(works: Iterable[Work], view: ctypes.Structure) -> None:
     """Write a view into launches that take one."""
     for work in works:
         if hasattr(work.arguments, "view"):
@@ -103,8 +103,8 @@ def blend_gradients(
         colors = {"g_color": upstream["color"], "gradients": sums["extras"]}
         colors |= {name: sums.get(name) for name in ("learns", "slots")}
         return work_of("blend_vjp_learning", blocks, lists, colors, pieces=pieces)
-    given = {name: tensor for name, tensor in upstream.items() if tensor is not None}
-    distortion, further = "distortion" in given, "depth_transmittance" in given
+    present = {name: tensor for name, tensor in upstream.items() if tensor is not None}
+    distortion, further = "distortion" in present, "depth_transmittance" in present
     if features is not None:
         kind = "features_vjp" + "_distortion" * distortion
     elif further:
@@ -112,12 +112,12 @@ def blend_gradients(
     elif distortion:
         kind = "blend_vjp_distortion"
     else:
-        geometry = not given.keys().isdisjoint(("normal", "depth_mean", "depth_median"))
+        geometry = not present.keys().isdisjoint(("normal", "depth_mean", "depth_median"))
         kind = f"blend_vjp_{'geometry' if geometry else 'color'}"
-    kept: dict[str, object] = {name: image for name, image in images.items() if name != "depth_median"}
-    kept |= {"pieces": pieces} | ({} if features is None else {"features": features})
-    gradients = {f"g_{name}": tensor for name, tensor in given.items()}
-    return work_of(f"{kind}{'_abs' if absolute else ''}", blocks, lists, kept, gradients, sums)
+    inputs: dict[str, object] = {name: image for name, image in images.items() if name != "depth_median"}
+    inputs |= {"pieces": pieces} | ({} if features is None else {"features": features})
+    gradients = {f"g_{name}": tensor for name, tensor in present.items()}
+    return work_of(f"{kind}{'_abs' if absolute else ''}", blocks, lists, inputs, gradients, sums)
 
 
 def splat_gradients(
@@ -131,11 +131,11 @@ def splat_gradients(
     """
     count = len(splats["means"])
     scalars = {"count": count, "sh_rest": splats["shN"].shape[1], "clears": int(clears)}
-    wanted = {f"g_{name}": tensor for name, tensor in gradients.items() if tensor is not None}
+    outputs = {f"g_{name}": tensor for name, tensor in gradients.items() if tensor is not None}
     if sums.get("gradients") is None:
-        colors = {name: splats[name] for name in ("means", "sh0", "shN")} | wanted
+        colors = {name: splats[name] for name in ("means", "sh0", "shN")} | outputs
         shared = {"tile_counts": sums["tile_counts"], "learns": sums.get("learns"), "gradients": sums["extras"]}
         return work_of("project_colors_vjp", blocks_of(count), scalars, colors, shared)
     probe = gradients.get("probe")
     scalars["probe_columns"] = 0 if probe is None else int(probe.shape[1])
-    return work_of("project_splats_vjp", blocks_of(count), scalars, splats, sums, wanted)
+    return work_of("project_splats_vjp", blocks_of(count), scalars, splats, sums, outputs)

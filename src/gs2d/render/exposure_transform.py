@@ -120,13 +120,13 @@ def fit_exposure(
     transform to the identity where the pixels do not determine it. The others are as for :func:`expose`.
     """
     check_shapes({"color": (color, "H W 3"), "target": (target, "H W 3"), "pixels": (pixels, "H W")})
-    light, weight, wanted = color.double(), torch.ones_like(color[..., :1], dtype=torch.float64), target.double()
+    light, weight, observed = color.double(), torch.ones_like(color[..., :1], dtype=torch.float64), target.double()
     if coverage is not None:
         assert background is not None
         weight = coverage.double()[..., None]
         behind = (1 - weight) * background.double()
-        light, wanted = light - behind, wanted - behind
+        light, observed = light - behind, observed - behind
     rows = torch.cat([light, weight], dim=-1)[pixels]  # [P, 4]
-    missing = (wanted - light)[pixels]  # [P, 3]
+    residual = (observed - light)[pixels]  # [P, 3]
     normal = rows.T @ rows + RIDGE * max(len(rows), 1) * torch.eye(4, dtype=rows.dtype, device=rows.device)
-    return (identity(rows) + torch.linalg.solve(normal, rows.T @ missing).T).to(color.dtype)
+    return (identity(rows) + torch.linalg.solve(normal, rows.T @ residual).T).to(color.dtype)

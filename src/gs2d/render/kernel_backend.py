@@ -31,13 +31,13 @@ class Gradients:
     """Inputs and outputs of a backward pass.
 
     ``saved`` are the outputs and hidden tensors of the forward pass, the parameters, and "values" and "background" of
-    further channels; its colours are [H, W, 3]. ``wanted`` is memory for the gradients of the parameters, "probe",
+    further channels; its colours are [H, W, 3]. ``outputs`` is memory for the gradients of the parameters, "probe",
     "intrinsics" [N, 4] and "values"; None: not computed.
     """
 
     saved: Mapping[str, Tensor]
     upstream: Mapping[str, Tensor | None]  # gradients of the images by name
-    wanted: Mapping[str, Tensor | None]
+    outputs: Mapping[str, Tensor | None]
     rows: Tensor | None  # [N] bool, splats with gradients; all others get zeros
     wide: tuple[Tensor, Tensor] | None  # the image with further channels [H, W, 3 + F], and its gradient
 
@@ -61,7 +61,7 @@ class KernelBackend(Backend):
         """
         raise NotImplementedError
 
-    def backward_pass(self, state: Any, given: Gradients) -> None:
+    def backward_pass(self, state: Any, grads: Gradients) -> None:
         """Compute gradients of a forward pass."""
         raise NotImplementedError
 
@@ -101,8 +101,8 @@ class KernelBackend(Backend):
     def _render(self, view: _View, splats: Splats, probe: Tensor | None, values: Tensor | None) -> RenderOutput:
         self.check(splats, view.settings)
         names = [*IMAGES, "radii", *["depth_transmittance"] * view.settings.with_transmittance_depth]
-        found = _Rasterize.apply(view, probe, view.camera.intrinsics, values, *(t for _, t in splats.items()))
-        return RenderOutput(**dict(zip(names, found, strict=True)))
+        outputs = _Rasterize.apply(view, probe, view.camera.intrinsics, values, *(t for _, t in splats.items()))
+        return RenderOutput(**dict(zip(names, outputs, strict=True)))
 
     def splat_errors(
         self,
@@ -185,14 +185,14 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *given: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
         backend: KernelBackend = ctx.view.backend
         saved = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         upstream = {
             name: None if tensor is None else tensor.detach().to(backend.dtype).contiguous()
-            for name, tensor in zip(ctx.names, given, strict=False)
+            for name, tensor in zip(ctx.names, cotangents, strict=False)
         }
-        want_probe, want_intrinsics, want_values, *want = ctx.needs_input_grad[1:]
+        needs_probe, needs_intrinsics, needs_values, *needed = ctx.needs_input_grad[1:]
         values, wide = saved.get("values"), None
         if values is not None:
             if upstream["color"] is not None:
@@ -201,18 +201,18 @@ class _Rasterize(torch.autograd.Function):
             saved["color"] = saved["color"][..., :3].contiguous()
         count, device = len(saved["means"]), saved["means"].device
         shapes: dict[str, Any] = {
-            name: saved[name].shape if w else None for name, w in zip(ATTRIBUTES, want, strict=True)
+            name: saved[name].shape if w else None for name, w in zip(ATTRIBUTES, needed, strict=True)
         }
-        shapes["probe"] = ctx.probe_shape if want_probe else None
-        shapes["intrinsics"] = (count, 4) if want_intrinsics else None
+        shapes["probe"] = ctx.probe_shape if needs_probe else None
+        shapes["intrinsics"] = (count, 4) if needs_intrinsics else None
         shapes["values"] = None if values is None or wide is None else values.shape
-        wanted = {name: None if shape is None else backend.empty(shape, device) for name, shape in shapes.items()}
-        backend.backward_pass(ctx.state, Gradients(saved, upstream, wanted, ctx.view.rows, wide))
-        if want_values and values is not None and wide is None:
-            wanted["values"] = torch.zeros_like(values)
-        each, total = wanted["intrinsics"], None
+        outputs = {name: None if shape is None else backend.empty(shape, device) for name, shape in shapes.items()}
+        backend.backward_pass(ctx.state, Gradients(saved, upstream, outputs, ctx.view.rows, wide))
+        if needs_values and values is not None and wide is None:
+            outputs["values"] = torch.zeros_like(values)
+        each, total = outputs["intrinsics"], None
         if each is not None and each.is_cpu:  # numpy adds row by row, whatever the number of threads
             total = torch.from_numpy(each.numpy().sum(axis=0, dtype=np.float64)).to(ctx.of_intrinsics)
         elif each is not None:
             total = each.sum(dim=0, dtype=torch.float64).to(ctx.of_intrinsics)
-        return None, wanted["probe"], total, wanted["values"], *(wanted[name] for name in ATTRIBUTES)
+        return None, outputs["probe"], total, outputs["values"], *(outputs[name] for name in ATTRIBUTES)

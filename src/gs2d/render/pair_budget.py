@@ -31,9 +31,9 @@ class PairBudget:
     The first rendering of an image size waits for its count of pairs; later ones do not wait. A known view gets
     VIEW_SLACK times its last count, scaled up if splats were added; views of one size differ by a factor of three. A
     new view gets SLACK times the largest count at its size, which decays slowly. If that is too little, the farthest
-    pairs are dropped. ``overflow`` then tells the device at once, so that updates change nothing, and ``overflowed``
-    tells the host later, so that the caller repeats the iteration with ``exact`` set. Both cover all renderings since
-    the last call of ``overflowed``, since an iteration may render two views.
+    pairs are dropped. ``overflow`` then reports it to the device at once, so that updates change nothing, and
+    ``overflowed`` to the host later, so that the caller repeats the iteration with ``exact`` set. Both cover all
+    renderings since the last call of ``overflowed``, since an iteration may render two views.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class PairBudget:
         self.overflow: Tensor | None = None  # [] int32 on the device: whether one lacks pairs; None: all were exact
         self._largest: dict[int, float] = {}  # by the number of tiles
         self._of_view: dict[bytes, tuple[int, int]] = {}  # pairs, and splats at that time, by camera
-        self._asked: list[tuple[Rendering, int]] = []  # renderings with unknown counts, and their room
+        self._pending: list[tuple[Rendering, int]] = []  # renderings with unknown counts, and their room
         self._host: list[Tensor] = []  # host memory for these counts, reused
         self._event: Any = None
 
@@ -50,12 +50,12 @@ class PairBudget:
         largest = self._largest.get(rendering.tiles)
         if self.exact or largest is None:
             return None
-        known = self._of_view.get(rendering.camera)
-        wanted = SLACK * largest
-        if known is not None:
-            pairs, splats = known
-            wanted = VIEW_SLACK * pairs * max(1.0, rendering.splats / max(splats, 1))
-        return min(-(-int(wanted) // STEP) * STEP, MAX_PAIRS)
+        last = self._of_view.get(rendering.camera)
+        target = SLACK * largest
+        if last is not None:
+            pairs, splats = last
+            target = VIEW_SLACK * pairs * max(1.0, rendering.splats / max(splats, 1))
+        return min(-(-int(target) // STEP) * STEP, MAX_PAIRS)
 
     def learn(self, rendering: Rendering, pairs: int) -> None:
         """Record the count of pairs of a rendering."""
@@ -66,24 +66,24 @@ class PairBudget:
                 self._of_view.clear()
             self._of_view[rendering.camera] = pairs, rendering.splats
 
-    def ask(self, rendering: Rendering, room: int, pairs: Tensor) -> None:
+    def fetch(self, rendering: Rendering, room: int, pairs: Tensor) -> None:
         """Copy the count of pairs [] int64 of a rendering with ``room`` to the host, without waiting."""
-        lacks = (pairs > room).to(torch.int32)
-        self.overflow = lacks if self.overflow is None else self.overflow | lacks
+        short = (pairs > room).to(torch.int32)
+        self.overflow = short if self.overflow is None else self.overflow | short
         self.expect(rendering, room, pairs.device).copy_(pairs, non_blocking=True)
-        self.asked(pairs.device)
+        self.record(pairs.device)
 
     def expect(self, rendering: Rendering, room: int, device: torch.device) -> Tensor:
         """Return the host tensor [] int64 for the count of pairs of a rendering with ``room``.
 
-        The caller writes it, sets ``overflow``, and calls :meth:`asked` after queueing the write.
+        The caller writes it, sets ``overflow``, and calls :meth:`record` after queueing the write.
         """
-        if len(self._host) == len(self._asked):
+        if len(self._host) == len(self._pending):
             self._host.append(torch.empty((), dtype=torch.int64, pin_memory=device.type == "cuda"))
-        self._asked.append((rendering, room))
-        return self._host[len(self._asked) - 1]
+        self._pending.append((rendering, room))
+        return self._host[len(self._pending) - 1]
 
-    def asked(self, device: torch.device) -> None:
+    def record(self, device: torch.device) -> None:
         """Record an event on the current stream, after which the counts are on the host."""
         if device.type == "cuda":
             self._event = self._event or torch.cuda.Event()
@@ -94,14 +94,14 @@ class PairBudget:
 
         Raises BackendError if an earlier kernel failed: torch reports it here first.
         """
-        asked, self._asked, self.overflow = self._asked, [], None
-        if asked and self._event is not None:
+        pending, self._pending, self.overflow = self._pending, [], None
+        if pending and self._event is not None:
             with fault_of("an iteration"):
                 self._event.synchronize()
-        numbers = [int(number.numpy()) for number in self._host[: len(asked)]]
-        for (rendering, _), pairs in zip(asked, numbers, strict=True):
+        numbers = [int(number.numpy()) for number in self._host[: len(pending)]]
+        for (rendering, _), pairs in zip(pending, numbers, strict=True):
             self.learn(rendering, pairs)
-        return any(pairs > room for (_, room), pairs in zip(asked, numbers, strict=True))
+        return any(pairs > room for (_, room), pairs in zip(pending, numbers, strict=True))
 
 
 def room_for(pairs: Tensor, rendering: Rendering, budget: PairBudget | None) -> int:
@@ -113,5 +113,5 @@ def room_for(pairs: Tensor, rendering: Rendering, budget: PairBudget | None) -> 
         if budget is not None:
             budget.learn(rendering, room)
     elif budget is not None:
-        budget.ask(rendering, room, pairs)
+        budget.fetch(rendering, room, pairs)
     return room

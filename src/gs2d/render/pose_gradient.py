@@ -63,8 +63,8 @@ class _Carry(torch.autograd.Function):
                 means, quats, shN = (torch.where(tensor.isfinite(), tensor, 0.0) for tensor in (means, quats, shN))
                 force, torque = _wrench(pose, means, quats, shN, ctx.degree, gradients)
             to_pose = pose_gradient(pose, force, torque)
-        wanted = ctx.needs_input_grad[3:]
-        return to_pose, None, None, *(g if want else None for g, want in zip(gradients, wanted, strict=True))
+        needed = ctx.needs_input_grad[3:]
+        return to_pose, None, None, *(g if need else None for g, need in zip(gradients, needed, strict=True))
 
 
 class _TurnNormals(torch.autograd.Function):
@@ -99,11 +99,11 @@ def _wrench(
     center = -T[:3, :3].T @ T[:3, 3]
     library = library_for(means)
     if library is not None:
-        given = {"points": means, "to_points": gradients[0], "quats": quats, "to_quats": gradients[1]}
+        fields = {"points": means, "to_points": gradients[0], "quats": quats, "to_quats": gradients[1]}
         if degree > 0:  # harmonics do not rotate with the scene
-            given |= {"shN": shN, "to_sh0": gradients[2]}
+            fields |= {"shN": shN, "to_sh0": gradients[2]}
         sizes = {"sh_rest": shN.shape[1], "degree": degree}
-        return _native_wrench(library, center, len(means), **given, **sizes)
+        return _native_wrench(library, center, len(means), **fields, **sizes)
     to_splats = means - center.to(means)  # [N, 3]
     force = gradients[0].sum(dim=0).double().cpu()
     products = _products(quats, gradients[1])  # [4, 4]
@@ -122,8 +122,8 @@ def _native_wrench(library: Library, center: Tensor, count: int, **tensors: Tens
     ``tensors`` are fields of ``struct Moved`` of ``kernels/cpu/camera.cpp``. Without ``quats`` the points are vectors
     that rotate. The result does not depend on the number of threads.
     """
-    given = {name: t.detach().contiguous() if isinstance(t, Tensor) else t for name, t in tensors.items()}
-    moved = arguments_of("gs2d_camera_wrench", count=count, center=tuple(center.tolist()), **given)
+    fields = {name: t.detach().contiguous() if isinstance(t, Tensor) else t for name, t in tensors.items()}
+    moved = arguments_of("gs2d_camera_wrench", count=count, center=tuple(center.tolist()), **fields)
     sums = torch.empty(2, 3, dtype=torch.float64)
     if library.call("gs2d_camera_wrench", moved, sums) != 0:
         raise MemoryError("gs2d_camera_wrench could not allocate its sums")

@@ -21,8 +21,8 @@ from gs2d.render.reference_projection import (
     PixelBlock,
     ScreenSplats,
     blocks,
+    contains_pixel,
     cutoff_squared,
-    holds_pixel,
     project,
     screen_boxes,
     visible_rows,
@@ -147,7 +147,7 @@ def _rasterize(
 
     longer = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) / 2
     radii = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
-    radii[rows] = torch.where(holds_pixel(boxes), longer, 0.0).to(splats.dtype)
+    radii[rows] = torch.where(contains_pixel(boxes), longer, 0.0).to(splats.dtype)
     return RenderOutput(
         color=images[..., 0:3] if features is None else torch.cat([images[..., 0:3], images[..., CHANNELS:]], dim=2),
         normal=images[..., 3:6],

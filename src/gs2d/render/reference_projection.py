@@ -98,8 +98,8 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
     Tw = H[:, 2]
     # c - (cx, cy) = f p.xy / p.z, hence Tu - c_x Tw = fx H_x - (c_x - cx) H_z
     offset = p[:, :2] / p[:, 2:]  # [M, 2]
-    given = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-    intrinsics = (given if camera.intrinsics is None else camera.intrinsics).to(means)  # [4]
+    fixed = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    intrinsics = (fixed if camera.intrinsics is None else camera.intrinsics).to(means)  # [4]
     focal, principal = intrinsics[:2], intrinsics[2:]
     Au = focal[0] * (H[:, 0] - offset[:, :1] * H[:, 2])
     Av = focal[1] * (H[:, 1] - offset[:, 1:] * H[:, 2])
@@ -193,10 +193,10 @@ def _square_boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: Ra
     squares = middle.square() - torch.stack([_dot(k2, A, A) / d for A in (Au, Av)], dim=1)
     half = squares.amax(dim=1).clamp(min=1e-4).sqrt().maximum(settings.clamp_px * k2.sqrt())
     middle = middle + center
-    known = middle.abs().sum(dim=1) + half < 1e9  # not if the disc only touches the plane
-    first = torch.where(known[:, None], middle - 0.5 - half.ceil()[:, None], 0.0)  # pixel centres at integers
+    bounded = middle.abs().sum(dim=1) + half < 1e9  # not if the disc only touches the plane
+    first = torch.where(bounded[:, None], middle - 0.5 - half.ceil()[:, None], 0.0)  # pixel centres at integers
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=d.device)
-    end = torch.where(known, 2 * half.ceil() + TILE - 1, 0.0)[:, None]
+    end = torch.where(bounded, 2 * half.ceil() + TILE - 1, 0.0)[:, None]
     lower, upper = (TILE * (side / TILE).clamp(min=0).floor() for side in (first, first + end))
     none = (upper <= lower).any(dim=1) | (lower >= size).any(dim=1)
     return torch.where(none[:, None], size.new_tensor([1.0, 1.0, 0.0, 0.0]), torch.cat([lower, upper.minimum(size)], 1))
@@ -207,7 +207,7 @@ def _dot(k2: Tensor, A: Tensor, B: Tensor) -> Tensor:
     return k2 * (A[:, :2] * B[:, :2]).sum(dim=1) - A[:, 2] * B[:, 2]
 
 
-def holds_pixel(boxes: Tensor) -> Tensor:
+def contains_pixel(boxes: Tensor) -> Tensor:
     """Whether a clipped box contains a pixel centre [M] bool."""
     first = (boxes[:, :2] - 0.5).ceil() + 0.5
     return (first <= boxes[:, 2:]).all(dim=1)

@@ -211,9 +211,9 @@ class _Numbers(NamedTuple):
     @property
     def settings(self) -> RasterSettings:
         """The constants as settings."""
-        given: dict[str, Any] = dict(zip(CONSTANTS, self.constants, strict=True))
+        constants: dict[str, Any] = dict(zip(CONSTANTS, self.constants, strict=True))
         names = ("lowpass_depth", "near_plane_policy", "with_distortion")
-        return RasterSettings(**given, **{name: getattr(self, name) for name in names})
+        return RasterSettings(**constants, **{name: getattr(self, name) for name in names})
 
     def render(self, tensors: _Tensors) -> Rasterization:
         """Render the tensors."""
@@ -333,8 +333,8 @@ def _check(tensors: _Tensors, sh_degree: int | None) -> int:
         if smallest < 0:
             raise ShapeError(f"scales must not be negative, got {smallest:.4g}; pass exp of logarithms")
         if lowest < 0 or highest < -1:
-            got = lowest if lowest < 0 else -highest
-            raise ShapeError(f"opacities must be in [0, 1], got {got:.4g}; pass the sigmoid of logits")
+            extreme = lowest if lowest < 0 else -highest
+            raise ShapeError(f"opacities must be in [0, 1], got {extreme:.4g}; pass the sigmoid of logits")
     return channels
 
 
@@ -394,7 +394,7 @@ _ARGUMENTS = (  # explicit, since schemas inferred from annotations differ betwe
     "str lowpass_depth, str near_plane_policy, bool with_distortion, str backend"
 )
 _FORWARD = f"({_ARGUMENTS}) -> ({', '.join(['Tensor'] * len(Rasterization._fields))})"
-_BACKWARD = f"(Tensor?[] upstream, bool[] wanted, {_ARGUMENTS}) -> Tensor[]"
+_BACKWARD = f"(Tensor?[] upstream, bool[] needed, {_ARGUMENTS}) -> Tensor[]"
 
 
 @torch.library.custom_op("gs2d::rasterize_2dgs", mutates_args=(), schema=_FORWARD)
@@ -414,15 +414,15 @@ def _(*arguments: Any) -> tuple[Tensor, ...]:
 
 
 @torch.library.custom_op("gs2d::rasterize_2dgs_backward", mutates_args=(), schema=_BACKWARD)
-def _backward_operator(upstream: Sequence[Tensor | None], wanted: Sequence[bool], *arguments: Any) -> list[Tensor]:
-    """Render again and return the gradients of the tensors marked in ``wanted``."""
+def _backward_operator(upstream: Sequence[Tensor | None], needed: Sequence[bool], *arguments: Any) -> list[Tensor]:
+    """Render again and return the gradients of the tensors marked in ``needed``."""
     tensors, numbers = arguments[:_TENSORS], _Numbers(*arguments[_TENSORS:])
     means = tensors[0]
     stream = torch.cuda.current_stream(means.device) if means.is_cuda else None
 
     def again() -> list[Tensor]:
         with torch.cuda.stream(stream):  # None has no effect
-            return _gradients(upstream, wanted, tensors, numbers)
+            return _gradients(upstream, needed, tensors, numbers)
 
     # Within an operator autograd is disabled in this thread, but not in another one.
     with ThreadPoolExecutor(1) as thread:
@@ -431,32 +431,32 @@ def _backward_operator(upstream: Sequence[Tensor | None], wanted: Sequence[bool]
 
 def _gradients(
     upstream: Sequence[Tensor | None],
-    wanted: Sequence[bool],
+    needed: Sequence[bool],
     tensors: Sequence[Tensor | None],
     numbers: _Numbers,
 ) -> list[Tensor]:
-    """Return the gradients of the tensors marked in ``wanted``; ``upstream`` are those of the images."""
+    """Return the gradients of the tensors marked in ``needed``; ``upstream`` are those of the images."""
     leaves: list[Any] = [
-        None if tensor is None else tensor.detach().requires_grad_(want)
-        for tensor, want in zip(tensors, wanted, strict=True)
+        None if tensor is None else tensor.detach().requires_grad_(need)
+        for tensor, need in zip(tensors, needed, strict=True)
     ]
-    learning = [leaf for leaf, want in zip(leaves, wanted, strict=True) if want]
+    learning = [leaf for leaf, need in zip(leaves, needed, strict=True) if need]
     images = numbers.render(_Tensors(*leaves))
     pairs = [(image, g) for image, g in zip(images, upstream, strict=True) if g is not None and image.requires_grad]
     if not pairs:
         return [torch.zeros_like(leaf) for leaf in learning]
     ends, cotangents = [image for image, _ in pairs], [g for _, g in pairs]
-    found = torch.autograd.grad(ends, learning, cotangents, allow_unused=True)
+    gradients = torch.autograd.grad(ends, learning, cotangents, allow_unused=True)
     return [
         torch.zeros_like(leaf) if gradient is None else gradient.clone()
-        for leaf, gradient in zip(learning, found, strict=True)
+        for leaf, gradient in zip(learning, gradients, strict=True)
     ]
 
 
 @_backward_operator.register_fake
-def _(upstream: Sequence[Tensor | None], wanted: Sequence[bool], *arguments: Any) -> list[Tensor]:
+def _(upstream: Sequence[Tensor | None], needed: Sequence[bool], *arguments: Any) -> list[Tensor]:
     tensors = arguments[:_TENSORS]
-    return [torch.empty_like(tensor) for tensor, want in zip(tensors, wanted, strict=True) if want]
+    return [torch.empty_like(tensor) for tensor, need in zip(tensors, needed, strict=True) if need]
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -467,9 +467,9 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
 
 
 def _backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-    wanted = list(ctx.needs_input_grad[:_TENSORS])
-    found = iter(_backward_operator(list(upstream), wanted, *ctx.saved_tensors, *ctx.options))
-    gradients = tuple(next(found) if want else None for want in wanted)
+    needed = list(ctx.needs_input_grad[:_TENSORS])
+    computed = iter(_backward_operator(list(upstream), needed, *ctx.saved_tensors, *ctx.options))
+    gradients = tuple(next(computed) if need else None for need in needed)
     return (*gradients, *[None] * len(ctx.options))
 
 

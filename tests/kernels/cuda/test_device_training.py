@@ -290,7 +290,7 @@ def test_a_fault_that_a_kernel_left_is_one_line_with_a_remedy_where_torch_meets_
 
     budget = cuda_budget.PairBudget()
     budget.learn(Rendering(7), 10)
-    budget.ask(Rendering(7), 20, torch.tensor(5))
+    budget.fetch(Rendering(7), 20, torch.tensor(5))
     budget._event = Broken()
     with pytest.raises(BackendError, match="illegal") as error:
         budget.overflowed()

@@ -48,7 +48,7 @@ def launcher_for(device):
     return launcher
 
 launch.launcher_for = launcher_for
-cuda_budget.PairBudget.ask = lambda self, tiles, room, pairs: setattr(self, "overflow", (pairs > room).to(torch.int32))
+cuda_budget.PairBudget.fetch = lambda self, key, room, pairs: setattr(self, "overflow", (pairs > room).to(torch.int32))
 budget = cuda_budget.PairBudget()
 """
 

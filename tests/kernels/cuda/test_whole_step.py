@@ -186,7 +186,7 @@ def test_reused_memory_and_the_order_of_threads_change_nothing(
     run = cuda_step.Stepper.run
 
     def poisoned(self: Any, *given: Any) -> bool:
-        held = self._arena._held
+        held = self._arena._tensors
         for name, tensor in held.items():
             if name not in ("gradient_rows", "extras"):
                 tensor.view(torch.int16).fill_(-1)
