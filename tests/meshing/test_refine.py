@@ -256,7 +256,7 @@ def test_the_solver_solves() -> None:
 
 # -- refinement --------------------------------------------------------------------------------------------------------
 CAMERAS = [camera_at(x, y, size=96) for x, y in ((-0.6, -0.5), (0.6, -0.5), (0.6, 0.5), (-0.6, 0.5), (0.0, 0.0))]
-QUICK = RefineSettings(factors=(1,), steps=8, face_pixels=1.0, split_pixels=40.0)
+QUICK = RefineSettings(factors=(1,), first_steps=8, face_pixels=1.0, split_pixels=40.0)
 
 
 @cache
@@ -339,7 +339,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads(fast: Library) -> N
 
 def test_work_is_counted_to_its_end(fast: Library) -> None:
     images, heard = photographs_of(True), list[int]()
-    settings = RefineSettings(factors=(2, 1), steps=1)
+    settings = RefineSettings(factors=(2, 1), first_steps=1, steps=1)
 
     def read(index: int, factor: int) -> GreyImage:
         item = images[index]

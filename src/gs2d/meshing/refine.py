@@ -5,11 +5,11 @@ The idea is that of Vu et al. 2012, "High accuracy and visibility-consistent den
     sum over pairs of views of sum over pixels of w (1 - NCC)
     + bending / 2 sum over vertices of A kappa^2 + tether / 2 sum over vertices of A m^2 / s^4
 
-plus a membrane term on each step. kappa is the mean curvature, kappa_0 a smooth version of
-that of the start, and A the area of a vertex, s the size of a pixel on the
-surface, m the distance that the vertex has moved. Each step solves the Gauss-Newton system of the distances along the
-normals, so surface without texture follows its surroundings. So does shiny surface, where w is 0: there photographs
-agree on reflections, which lie elsewhere. Formulas: docs/math.md, "Mesh refinement".
+plus a membrane term on each step. kappa is the difference of the mean curvature from a smooth version of that of the
+start, A the area of a vertex, s the size of a pixel on the surface, and m the distance that the vertex has moved. Each
+step solves the Gauss-Newton system of the distances along the normals, so surface without texture follows its
+surroundings. Shiny surface stays near its start, with a stronger tether and w = 0: there photographs agree on
+reflections, which lie elsewhere. Formulas: docs/math.md, "Mesh refinement".
 """
 
 from __future__ import annotations
@@ -57,9 +57,10 @@ TINY = 1e-12
 REPEATED = 0.6  # a point that a perfect neighbour sees loses this fraction of its value for further ones
 COARSE_SIDE = 350  # px, shorter side of the first images
 LEAST_ANGLE, BEST_ANGLE, MOST_ANGLE = 4.0, 14.0, 35.0  # degrees between the rays of two views to a surface point
-BENDING, MEMBRANE, TETHER = 12.0, 0.01, 0.03
-"""Weights of the curvature, of differences between the steps of neighbouring vertices, and of the distance from the
-start. Independent of the size of the scene and of the images."""
+BENDING, MEMBRANE = 16.0, 0.01
+"""Weights of the curvature, and of differences between the steps of neighbouring vertices. Independent of the size of
+the scene and of the images."""
+TETHER, SHINY_TETHER = 0.003, 0.03  # weight of the distance from the start, and what shiny surface adds
 SMOOTH_RINGS = 6  # of neighbours: the mean of the curvature over them is kept, so bends and edges stay, noise does not
 LONGEST_STEP = 1.0  # px, of a vertex
 SOLVER_STEPS = 60  # iterations of the solver in a step, at most
@@ -82,7 +83,8 @@ class RefineSettings:
 
     # The photographs are downscaled by these, one after the other. Empty: down to a shorter side of ``COARSE_SIDE``.
     factors: tuple[int, ...] = ()
-    steps: int = 6  # Gauss-Newton steps at each of them
+    first_steps: int = 16  # Gauss-Newton steps at the first of them, where vertices move farthest
+    steps: int = 6  # at each of the others
     neighbours: int = 3  # views that each view is compared with, at most
     face_pixels: float = 1.5  # mean number of pixels of a face after simplification
     split_pixels: float = 6.0  # number of pixels of the largest faces
@@ -135,12 +137,15 @@ class Refinement:
         self._factors = settings.factors or coarse_to_fine(self._cameras, COARSE_SIDE)
         self._cache_bytes = cache_bytes(CACHE_BYTES) // 3  # for photographs, for their usable pixels and for depth maps
         self._done = 0
-        rounds = settings.steps * sum(self._cost(factor) for factor in self._factors) + self._cost(self._factors[0])
+        rounds = self._cost(self._factors[0]) + sum(self._steps(f) * self._cost(f) for f in self._factors)
         self.work = rounds * len(self._cameras)
 
     def _cost(self, factor: int) -> int:
         """Return the cost of a view, in views of the smallest size."""
         return (max(self._factors) // factor) ** 2
+
+    def _steps(self, factor: int) -> int:
+        return self._settings.first_steps if factor == self._factors[0] else self._settings.steps
 
     def run(self, on_work: Callable[[int], None]) -> Mesh:
         """Refine the mesh, which gets the colours of the nearest vertices of the input.
@@ -203,7 +208,7 @@ class Refinement:
         if factor == self._factors[0]:
             matt, kept = self._trusted(surface, views(surface), curvature)
             now = replace(now, matt=matt, kept=kept)
-        for _ in range(self._settings.steps):
+        for _ in range(self._steps(factor)):
             surface = Surface(now.vertices, now.faces, now.normals())
             now = self._moved(now, factor, surface.normals, self._derivatives(surface, views(surface)), bend)
         return now
@@ -264,7 +269,7 @@ class Refinement:
         size = factor * now.size
         curvature = Curvature.of(now.vertices, now.faces, normals)
         stiff = csr_array(curvature.change.T @ diags_array(BENDING * curvature.areas))
-        tether = TETHER * curvature.areas / size**4
+        tether = (TETHER + SHINY_TETHER * (1 - now.matt)) * curvature.areas / size**4
         offset = ((now.vertices - now.start) * normals).sum(axis=1)
         joint = diags_array(np.sqrt(MEMBRANE) / size)
         matrix = (
