@@ -78,7 +78,7 @@ def run(argv: Sequence[str]) -> int:
         return PIPE_CLOSED
     except Exception as error:
         console.close()
-        if getattr(error, "told", False):  # contact to another process was lost, and that process reports the reason
+        if getattr(error, "reported", False):  # lost contact to another process, which reports the reason
             return EXIT_USAGE
         return _report(error, command.verbose)
 
