@@ -27,7 +27,7 @@ from gs2d.contrib.lab.aggregate import Cell, read_cell
 from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper_recipes import ABSGS_DEFAULT
-from gs2d.contrib.lab.scenes import FoundScene, find_scenes
+from gs2d.contrib.lab.scenes import SweepScene, find_scenes
 from gs2d.contrib.lab.table_plan import make_task, trained_recipe
 from gs2d.contrib.lab.training_task import TrainingTask
 from gs2d.core.atomic_files import atomic_write
@@ -71,7 +71,7 @@ class Candidate:
 CANDIDATES = tuple(Candidate(g, s) for g, s in itertools.product(FACTORS, FACTORS))
 
 
-def make_jobs(options: SweepOptions, scenes: Sequence[FoundScene]) -> dict[tuple[Candidate, str, int], TrainingTask]:
+def make_jobs(options: SweepOptions, scenes: Sequence[SweepScene]) -> dict[tuple[Candidate, str, int], TrainingTask]:
     """Return one run per candidate, scene and seed."""
     jobs = {}
     for candidate, scene, seed in itertools.product(CANDIDATES, scenes, options.seeds):
@@ -155,7 +155,7 @@ def sweep(options: SweepOptions) -> Candidate | None:
             "seed": seed,
             "test_on": scene.protocol.test_on,
         }
-        cells[candidate].append(read_cell(job.train.out, record=job.outcome(), **place))
+        cells[candidate].append(read_cell(job.train.out, record=job.status(), **place))
     chosen = choose(cells)
     command = shlex.join(["python", "-m", "benchmarks.absgs", *sys.argv[1:]])
     found = [{**c.thresholds, "runs": [cell.to_json() for cell in cells[c]]} for c in CANDIDATES]

@@ -203,7 +203,7 @@ def surface(job: LoadedRun, trainer: Trainer, spec: dict[str, Any], folder: Path
     scene = trainer.scene_now()
     mesh = extract_mesh(Trained(trainer.splats, scene, job.protocol, job.settings, job.backend, job.recipe))
     seconds = time.process_time() - start
-    found = score_surface(mesh, truth, job.scene, folder=folder / "surface", tell=lambda text: None)
+    found = score_surface(mesh, truth, job.scene, folder=folder / "surface", notify=lambda text: None)
     fractions = map(str, VISIBLE_SURFACE.fractions)
     return {
         "surface": {

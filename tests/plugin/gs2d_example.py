@@ -187,7 +187,7 @@ class VertexCount:
 
     has_thresholds = False
 
-    def find(self, capture, given, tell):
+    def find(self, capture, ground_truth, notify):
         path = capture / "vertices.txt"
         return int(path.read_text()) if path.is_file() else None
 

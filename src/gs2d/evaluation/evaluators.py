@@ -13,9 +13,9 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 
-GENERAL = "visible-surface"  # the evaluator for captures of no known data set; asked last
+GENERAL = "visible-surface"  # the evaluator for captures of other data sets; tried last
 
 
 class Evaluator(Protocol):
@@ -26,11 +26,11 @@ class Evaluator(Protocol):
 
     has_thresholds: bool
 
-    def find(self, capture: Path, given: Path | None, tell: Tell) -> Any | None:
+    def find(self, capture: Path, ground_truth: Path | None, notify: Notify) -> Any | None:
         """Return the ground truth of a capture, or None if this evaluator has none for it.
 
-        ``given`` is the file or folder that the user requested; without it, the truth may be beside the capture.
-        ``tell`` receives a message about each missing file. An incomplete folder is a DataError.
+        ``ground_truth`` is the file or folder that the user requested; without it, the truth may be beside the capture.
+        ``notify`` receives a message about each missing file. An incomplete folder is a DataError.
         """
 
     def score(
@@ -52,7 +52,7 @@ def register_evaluator(name: str) -> Callable[[Register], Register]:
     Parameters
     ----------
     name : str
-        Name of the evaluator; must not be taken.
+        Name of the evaluator; must not be registered already.
 
     Returns
     -------
@@ -63,28 +63,28 @@ def register_evaluator(name: str) -> Callable[[Register], Register]:
 
 
 @dataclass(frozen=True, eq=False)
-class FoundTruth:
-    """A ground truth, and the evaluator that found it."""
+class SurfaceTruth:
+    """A ground truth, and its evaluator."""
 
     name: str  # of the evaluator
     evaluator: Evaluator
     truth: Any  # from ``evaluator.find``
 
 
-def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | None:
-    """Return the ground truth of a capture, from the file or folder ``given``, or beside the capture.
+def choose_truth(ground_truth: Path | None, capture: Path, notify: Notify) -> SurfaceTruth | None:
+    """Return the ground truth of a capture, from the file or folder ``ground_truth``, or beside the capture.
 
     Evaluators of data sets come first, then the general one.
 
-    Raise DataError if ``given`` contains no ground truth of this capture.
+    Raise DataError if ``ground_truth`` contains no ground truth of this capture.
     """
     for name, make in sorted(EVALUATORS.working(), key=lambda item: item[0] == GENERAL):
         evaluator = make()
-        truth = evaluator.find(capture, given, tell)
+        truth = evaluator.find(capture, ground_truth, notify)
         if truth is not None:
-            return FoundTruth(name, evaluator, truth)
-    if given is not None:
-        raise DataError(f"no evaluator reads {given}; evaluators: {', '.join(EVALUATORS) or 'none'}")
+            return SurfaceTruth(name, evaluator, truth)
+    if ground_truth is not None:
+        raise DataError(f"no evaluator reads {ground_truth}; evaluators: {', '.join(EVALUATORS) or 'none'}")
     return None
 
 
@@ -95,12 +95,12 @@ def check_thresholds(thresholds: tuple[float, ...]) -> None:
 
 
 def score_surface(
-    mesh: Mesh, found: FoundTruth, scene: Scene, *, folder: Path, tell: Tell, thresholds: tuple[float, ...] = ()
+    mesh: Mesh, truth: SurfaceTruth, scene: Scene, *, folder: Path, notify: Notify, thresholds: tuple[float, ...] = ()
 ) -> dict[str, Any]:
     """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); write coloured clouds to ``folder``."""
-    if thresholds and not found.evaluator.has_thresholds:
-        tell(f"--set thresholds is ignored: the evaluator {found.name} has its own protocol")
-    facts = found.evaluator.score(mesh, found.truth, scene, folder=folder, thresholds=thresholds)
-    for message in facts["self_check"]["messages"]:
-        tell(message)
-    return {"evaluator": found.name, **facts}
+    if thresholds and not truth.evaluator.has_thresholds:
+        notify(f"--set thresholds is ignored: the evaluator {truth.name} has its own protocol")
+    scores = truth.evaluator.score(mesh, truth.truth, scene, folder=folder, thresholds=thresholds)
+    for message in scores["self_check"]["messages"]:
+        notify(message)
+    return {"evaluator": truth.name, **scores}

@@ -96,7 +96,7 @@ def test_what_a_task_tells_comes_back_with_its_name(ray: FakeRay, tmp_path: Path
     assert any(text.startswith("a starts on ") for text in heard)
     assert "a: odd" in heard
     assert heard.count("bad failed: expected a photograph, got none") == 1
-    assert jobs[0].outcome()["state"] == "done"
+    assert jobs[0].status()["state"] == "done"
     assert failures(jobs) == {"bad": "expected a photograph, got none"}
     assert not list((tmp_path / "jobs").glob("*.token"))
 
@@ -109,7 +109,7 @@ def test_a_task_whose_machines_are_lost_fails_and_the_others_go_on(
     heard_of(jobs, tmp_path)
     reason = "its process or machine was lost repeatedly, or ran out of memory (WorkerCrashedError)"
     assert failures(jobs) == {"a": reason}
-    assert jobs[1].outcome()["state"] == "done"
+    assert jobs[1].status()["state"] == "done"
 
 
 def test_an_interrupt_cancels_what_runs_first_gently(ray: FakeRay, tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_a_machine_that_does_not_see_the_folder_says_so(stays: Path) -> None:
     found = do_on_worker(order_of(task, stays) | {"token": "of another disk"}, FakeQueue({"num_cpus": 0}))
     assert found["state"] == "refused"
     assert f"of the cluster does not see {stays}; --out, and the capture, must lie on a disk" in found["reason"]
-    assert task.outcome()["state"] == "new"
+    assert task.status()["state"] == "new"
 
 
 def test_without_ray_the_command_says_what_to_install(
@@ -185,7 +185,7 @@ def test_without_the_option_ray_is_never_imported() -> None:
         "folder = Path(tempfile.mkdtemp())\n"
         "jobs = make_jobs(folder, {'a': ()})\n"
         "execute(jobs, folder)\n"
-        "assert jobs[0].outcome()['state'] == 'failed'\n"  # there is no capture; but it was tried
+        "assert jobs[0].status()['state'] == 'failed'\n"  # there is no capture; but it was tried
         "assert not [name for name in sys.modules if name.startswith('ray.') or 'lab.cluster' in name]\n"
     )
     helpers = str(Path(__file__).resolve().parents[2] / "helpers")

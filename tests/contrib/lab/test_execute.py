@@ -109,7 +109,7 @@ def test_a_folder_that_another_command_works_in_is_refused_and_taken_over_when_i
             execute(jobs, tmp_path)
         assert done == []
         process.send_signal(signal.SIGKILL)
-    assert jobs[1].outcome()["state"] == "running"
+    assert jobs[1].status()["state"] == "running"
     execute(jobs, tmp_path)
     assert done == ["b", "c"]
 

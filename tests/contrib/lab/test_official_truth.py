@@ -36,7 +36,7 @@ def scored(mesh: Mesh, root: Path, folder: Path, given: Path | None = None, **op
     heard: list[str] = []
     truth = choose_truth(given, root, heard.append)
     assert truth is not None
-    result = score_surface(mesh, truth, load_scene(root), folder=folder, tell=heard.append, **options)
+    result = score_surface(mesh, truth, load_scene(root), folder=folder, notify=heard.append, **options)
     assert set(result) >= HEADLINE
     assert set(result["self_check"]) >= {"ok", "messages"}
     json.dumps(result, allow_nan=False)  # what metrics.json can hold
@@ -130,7 +130,7 @@ def test_the_visible_surface_has_its_headline_at_a_quarter_of_a_per_cent_of_the_
     assert truth is not None
     assert truth.name == GENERAL
     scene: Any = SimpleNamespace(train=(), T_metric_scene=np.eye(4))
-    result = score_surface(flat(0.01), truth, scene, folder=tmp_path, tell=ignore)
+    result = score_surface(flat(0.01), truth, scene, folder=tmp_path, notify=ignore)
     assert set(result) >= HEADLINE
     assert result["evaluator"] == "visible-surface"
     assert [row["f_score"] for row in result["thresholds"]] == [0, 1, 1]
@@ -141,6 +141,6 @@ def test_the_visible_surface_has_its_headline_at_a_quarter_of_a_per_cent_of_the_
     assert len(read_points(tmp_path / "recall.ply").points) == result["truth_points"]
     assert result["files"]["picture"].endswith("/surface.png")
     far: list[str] = []
-    elsewhere = score_surface(flat(0.5), truth, scene, folder=tmp_path, tell=far.append)
+    elsewhere = score_surface(flat(0.5), truth, scene, folder=tmp_path, notify=far.append)
     assert not elsewhere["self_check"]["ok"]
     assert "check its coordinate system" in far[-1]

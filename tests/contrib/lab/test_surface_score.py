@@ -178,13 +178,13 @@ def test_true_surface_seen_by_few_cameras_is_not_scored() -> None:
 def test_view_counts_of_the_data_are_used() -> None:
     truth = merged(square(0.0), square(-1.0))
     seen = np.array([5, 5, 2, 2])
-    score = evaluate_surface(square(0.0), truth, seen=seen, thresholds=[0.01], samples=4000)
+    score = evaluate_surface(square(0.0), truth, view_counts=seen, thresholds=[0.01], samples=4000)
     assert score.scores[0].recall == 1
     assert score.truth_hidden == pytest.approx(0.5, abs=0.001)
-    low = evaluate_surface(square(0.0), truth, seen=seen, min_views=2, thresholds=[0.01], samples=4000)
+    low = evaluate_surface(square(0.0), truth, view_counts=seen, min_views=2, thresholds=[0.01], samples=4000)
     assert low.scores[0].recall == pytest.approx(0.5, abs=0.001)
     with pytest.raises(DataError, match="one count for each of 4"):
-        evaluate_surface(square(0.0), truth, seen=seen[:3])
+        evaluate_surface(square(0.0), truth, view_counts=seen[:3])
 
 
 def test_invisible_reconstructed_surface_is_not_scored() -> None:
@@ -200,7 +200,7 @@ def test_invisible_reconstructed_surface_is_not_scored() -> None:
 
 def test_reconstruction_on_unseen_true_surface_is_correct() -> None:
     truth = merged(square(0.0), square(-1.0))
-    score = evaluate_surface(square(-1.0), truth, seen=np.array([3, 3, 0, 0]), thresholds=[0.01], samples=1000)
+    score = evaluate_surface(square(-1.0), truth, view_counts=np.array([3, 3, 0, 0]), thresholds=[0.01], samples=1000)
     assert score.scores[0].precision == 1
     assert score.scores[0].recall == 0
 

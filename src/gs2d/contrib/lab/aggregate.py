@@ -35,8 +35,8 @@ class Cell:
 
     def to_json(self) -> dict[str, Any]:
         """Return scene, seed and figures as one flat object."""
-        facts = {"scene": self.scene, "data_set": self.data_set, "seed": self.seed, **self.figures}
-        return {**facts, "reasons": self.reasons, "run": str(self.run), **self.details}
+        entry = {"scene": self.scene, "data_set": self.data_set, "seed": self.seed, **self.figures}
+        return {**entry, "reasons": self.reasons, "run": str(self.run), **self.details}
 
 
 @dataclass(frozen=True)
@@ -99,46 +99,46 @@ class Results:
 
     def mean(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
         """Return each figure as the mean over scenes of the mean over seeds; None without values."""
-        found: dict[str, float | None] = {}
+        figures: dict[str, float | None] = {}
         for name in FIGURES:
             values = self._values(row, name, data_set)
             means = [statistics.fmean(by_seed.values()) for by_seed in values.values()]
-            found[name] = statistics.fmean(means) if means else None
-        return found
+            figures[name] = statistics.fmean(means) if means else None
+        return figures
 
     def spread(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
         """Return the deviation over seeds of the mean over scenes; None with fewer than two complete seeds."""
-        found: dict[str, float | None] = {}
+        figures: dict[str, float | None] = {}
         for name in FIGURES:
             means = by_seed(self._values(row, name, data_set))
-            found[name] = statistics.stdev(means) if len(means) > 1 else None
-        return found
+            figures[name] = statistics.stdev(means) if len(means) > 1 else None
+        return figures
 
     def _values(self, row: Row, name: str, data_set: str | None) -> dict[str, dict[int, float]]:
         """Return the values in the mean by scene and seed."""
         counted = self.counted(name, data_set)
-        found: dict[str, dict[int, float]] = {}
+        by_scene: dict[str, dict[int, float]] = {}
         for cell in row.of(data_set):
             value = cell.figures[name]
             if value is not None and (cell.scene, cell.seed) in counted:
-                found.setdefault(cell.scene, {})[cell.seed] = value
-        return found
+                by_scene.setdefault(cell.scene, {})[cell.seed] = value
+        return by_scene
 
     def reasons(self, row: Row) -> dict[str, str]:
         """Return the reasons of figures without a mean."""
         if not row.cells:
             why = "not trained here" if row.recipe is None else "not trained yet"
             return dict.fromkeys(FIGURES, why)
-        means, found = self.mean(row), {}
+        means, reasons = self.mean(row), {}
         for name in (n for n in FIGURES if means[n] is None):
             cell = next((c for c in row.cells if c.figures[name] is None), None)
             if len(kinds := self._kinds(name, None)) > 1 and name not in IMAGES:
-                found[name] = f"measured in different ways, which have no common mean: {'; '.join(sorted(kinds))}"
+                reasons[name] = f"measured in different ways, which have no common mean: {'; '.join(sorted(kinds))}"
             elif cell is None:
-                found[name] = "no scene and seed that every row has"
+                reasons[name] = "no scene and seed that every row has"
             else:
-                found[name] = f"{cell.scene}, seed {cell.seed}: {cell.reasons.get(name, 'not measured')}"
-        return found
+                reasons[name] = f"{cell.scene}, seed {cell.seed}: {cell.reasons.get(name, 'not measured')}"
+        return reasons
 
 
 def measured_on(cell: Cell, metric: str) -> str:
@@ -176,8 +176,8 @@ def read_cell(
 ) -> Cell:
     """Return the figures of a run from its ``metrics.json``; missing ones are None, with a reason.
 
-    ``test_on`` ("test" or "train") names the views whose image metrics count, ``record`` is the outcome of the task of
-    the run. The protocol's ``conventions`` say which image metrics count, and the main figure of the surface.
+    ``test_on`` ("test" or "train") names the views whose image metrics count, ``record`` is the record of the run's
+    task. The protocol's ``conventions`` say which image metrics count, and the main figure of the surface.
     """
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
     place: dict[str, Any] = {"scene": scene, "data_set": data_set, "seed": seed, "run": run}
@@ -291,22 +291,22 @@ def check_claim(claim: Claim, rows: Sequence[Row], data_set: str) -> ClaimResult
     if metric == "surface":
         metric = surface_metric(rows, data_set)
     by_name = {row.name: row for row in rows}
-    facts = (claim.text, metric, claim.kind, data_set)
+    common = (claim.text, metric, claim.kind, data_set)
     for name in claim.rows:
         cells = by_name[name].of(data_set)
         if all(cell.figures[metric] is None for cell in cells):
             why = cells[0].reasons.get(metric, "not measured") if cells else "not trained"
-            return ClaimResult(*facts, "unknown", (), f"no {METRICS[metric]} of {name}: {why}")
+            return ClaimResult(*common, "unknown", (), f"no {METRICS[metric]} of {name}: {why}")
     steps = tuple(_step(by_name[a], by_name[b], metric, data_set, claim) for a, b in _pairs(claim))
     if not all(step.seeds for step in steps):
-        return ClaimResult(*facts, "unknown", (), "no seed at which both rows have all of their scenes")
+        return ClaimResult(*common, "unknown", (), "no seed at which both rows have all of their scenes")
     if all(step.seeds_with_sign == step.seeds for step in steps):
         holds = "yes"
     elif any(step.seeds_with_sign == 0 for step in steps):
         holds = "no"
     else:
         holds = "open"
-    return ClaimResult(*facts, holds, steps)
+    return ClaimResult(*common, holds, steps)
 
 
 def _pairs(claim: Claim) -> list[tuple[str, str]]:
@@ -321,12 +321,12 @@ def _pairs(claim: Claim) -> list[tuple[str, str]]:
 def _step(lower: Row, upper: Row, metric: str, data_set: str, claim: Claim) -> StageStep:
     sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
     values = {row.name: {(c.scene, c.seed): c.figures[metric] for c in row.of(data_set)} for row in (lower, upper)}
-    found: dict[str, dict[int, float]] = {}
+    by_scene: dict[str, dict[int, float]] = {}
     for (scene, seed), high in values[upper.name].items():
         low = values[lower.name].get((scene, seed))
         if high is not None and low is not None:
-            found.setdefault(scene, {})[seed] = sign * (high - low)
-    differences = by_seed(found)
+            by_scene.setdefault(scene, {})[seed] = sign * (high - low)
+    differences = by_seed(by_scene)
     within = claim.within or 0.0
     if claim.kind == "flat":
         right = [abs(d) <= within for d in differences]

@@ -1,4 +1,4 @@
-"""Alignment of clouds of points: thinned, and moved onto each other by iterative closest points."""
+"""Thin point clouds and align them by iterative closest points."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _grouped(
 
 
 def uniform_downsample(points: np.ndarray, limit: int) -> np.ndarray:
-    """Every k-th point where there are more than ``limit``, k = round(P / limit); else all of them."""
+    """Return every k-th point, k = round(P / limit), if there are more than ``limit`` points; else all of them."""
     if len(points) <= limit:
         return points
     return points[:: max(1, round(len(points) / limit))]
@@ -63,13 +63,13 @@ def uniform_downsample(points: np.ndarray, limit: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class IcpResult:
-    """What an alignment found."""
+    """The result of an alignment."""
 
     T_target_source: np.ndarray  # [4, 4]
-    fraction_before: float  # part of the source with a target within the threshold, at the start
-    fraction: float  # and at the end
-    rms_before: float | None  # of the distances of those; None where there are none
-    rms: float | None
+    fraction_before: float  # fraction of the source with a target within the threshold, at the start
+    fraction: float  # the same at the end
+    rms_before: float | None  # rms distance of these pairs at the start; None without pairs
+    rms: float | None  # the same at the end
     iterations: int
 
 
@@ -84,9 +84,9 @@ def icp(
 ) -> IcpResult:
     """Move ``source`` [P, 3] onto ``target`` [Q, 3]: pair with the nearest, fit, repeat (Besl and McKay 1992).
 
-    Pairs farther apart than ``threshold`` do not count. It has converged when the share of paired points and their rms
-    change by less than ``fraction_change`` and ``rms_change``, both; the official Tanks and Temples script leaves the
-    rms out in effect (it passes 20).
+    Pairs farther apart than ``threshold`` do not count. Stops when the share of paired points changes by less than
+    ``fraction_change`` and their rms by less than ``rms_change``. The official Tanks and Temples script passes an
+    ``rms_change`` of 20, which is always met.
     """
     cloud = Cloud(target)
     T = np.eye(4)
@@ -106,10 +106,10 @@ def icp(
 
 
 def _paired(cloud: Cloud, points: np.ndarray, threshold: float) -> tuple[float, float, np.ndarray, np.ndarray]:
-    """Share and rms of the points with a neighbour within the threshold, the neighbours, and which points those are."""
+    """Return share and rms of points with a neighbour within the threshold, the neighbours [P], and a mask [P]."""
     if not len(points):
         return 0.0, 0.0, np.zeros(0, np.int64), np.zeros(0, bool)
-    distances, index = (found[:, 0] for found in cloud.nearest(points, limit=threshold))
+    distances, index = (column[:, 0] for column in cloud.nearest(points, limit=threshold))
     paired = np.isfinite(distances)
     rms = float(np.sqrt(np.square(distances[paired]).mean())) if paired.any() else 0.0
     return float(paired.mean()), rms, index, paired

@@ -1,4 +1,4 @@
-"""The initial state of a block, on disk: which splats of the coarse model it trains, and exposures of its views."""
+"""Read and write the initial state of a block: the coarse splats that it trains, and exposures of its views."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gs2d.training.events import OnEvent
 from gs2d.training.start.initialize import splats_as_start
 from gs2d.training.trainer import TrainerOptions
 
-ABSENT, FROZEN, OWN = 0, 1, 2  # of a row of the splats that were trained before
+ABSENT, FROZEN, OWN = 0, 1, 2  # states of a row of the coarse splats
 
 
 def write_start(path: Path, rows: np.ndarray, exposures: np.ndarray | None) -> None:
@@ -98,7 +98,7 @@ class TrainedPart:
     views: tuple[str, ...] = ()  # names of the training views, without test views; (): the split of the capture
     extent: float | None = None  # world units; None: that of the capture
     own: Splats | None = None  # the splats that are trained; None: initialised from points
-    # The frozen splats around them, the region of a dense start, and given exposures.
+    # The frozen splats around them, the region of a dense start, and fixed exposures.
     options: TrainerOptions = field(default_factory=TrainerOptions)
     digest: str | None = None  # hash of `own` and `options`
 
@@ -111,7 +111,7 @@ class TrainedPart:
         missing = [name for name in self.views if name not in by_name]
         if missing:
             raise DataError(
-                f"{scene.root} lacks the training view {missing[0]} of this part ({len(missing)} missing); restore the "
+                f"{scene.root} has no training view {missing[0]} of this part ({len(missing)} missing); restore the "
                 "capture, or use another --out"
             )
         return replace(scene, train=tuple(by_name[name] for name in self.views), test=())

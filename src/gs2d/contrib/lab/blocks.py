@@ -47,7 +47,7 @@ from gs2d.training.events import Notice, OnEvent, ignore
 
 BLOCKS_JSON = "blocks.json"  # in the run folder: the definition of the blocks
 COARSE, PARTITION, MERGE, FINISH = "coarse", "partition", "merge", "finish"
-RETRIES = 2  # of killed tasks, which may have lacked memory
+RETRIES = 2  # of killed tasks, which may have run out of memory
 
 
 # -- tasks -------------------------------------------------------------------------------------------------------------
@@ -65,7 +65,7 @@ class BlocksTask(Task):
 
     def is_done(self) -> bool:
         """Return whether the task is finished; a skipped block has no outputs."""
-        return super().is_done() or bool(self.outcome().get("skipped"))
+        return super().is_done() or bool(self.status().get("skipped"))
 
     def with_threads(self, threads: int) -> BlocksTask:
         """Return the task with another number of CPU threads."""
@@ -93,13 +93,13 @@ class BlocksTask(Task):
         return from_json(settled_of(self.options.out)["partition"])
 
     def settled(self, on_event: OnEvent) -> LoadedRun:
-        """Return what the blocks share, with the scene."""
+        """Return the run settings that all blocks share, with the scene."""
         self.limit()
         data = settled_of(self.options.out)
         options = replace(self.options, memory=self.memory, protocol=self.protocol(), test_every=None)
-        found = settle(options, on_event, recipe_from_json(data["recipe"]))
-        check_capture(self.options.out, data, found.resolved.scene.digest)
-        return found
+        settled = settle(options, on_event, recipe_from_json(data["recipe"]))
+        check_capture(self.options.out, data, settled.resolved.scene.digest)
+        return settled
 
 
 def train_coarse(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
@@ -117,13 +117,13 @@ def cut_coarse(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
     coarse = open_run(coarse_folder(out))
     make_folder(partition_folder(out))
     splats = finished_splats(coarse).to(settled.backend.device)
-    found = split_model(
+    split = split_model(
         settled.trained(splats, with_learned_appearance(coarse, settled.recipe, settled.scene)),
         task.partition(),
         partition_folder(out),
         on_event,
     )
-    return {"blocks": {block.name: len(block.views) for block in found.blocks}}
+    return {"blocks": {block.name: len(block.views) for block in split.blocks}}
 
 
 def train_block(task: BlocksTask, on_event: OnEvent) -> dict[str, Any]:
@@ -238,8 +238,8 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
         return _one_training(options, training, on_event)
     settled = settle(training, on_event)
     if not partition.grid and begun:
-        found = settled_of(options.out)["partition"]
-        partition = replace(from_json(found), **_requested(partition))
+        saved = settled_of(options.out)["partition"]
+        partition = replace(from_json(saved), **_requested(partition))
     elif not partition.grid:
         fitting = fitting_partition(settled, training, partition, on_event)
         if fitting is None:
@@ -295,7 +295,7 @@ def training_of(options: BlocksOptions) -> TrainOptions:
 
 
 def check_folder(out: Path) -> None:
-    """Raise if a folder holds something else."""
+    """Raise if a folder contains other files than those of a training in blocks."""
     if (out / BLOCKS_JSON).exists():
         return
     check_claim(out, resume=True, overwrite=False, allowed=(LOCK, "jobs"))

@@ -11,7 +11,7 @@ import numpy as np
 from gs2d.errors import RunError
 
 TRIMMED = 0.01  # fraction of the weight at either end that is ignored for the sides of cells
-_DIGITS = 12  # to which weights are rounded, as their last bits depend on the machine
+_DIGITS = 12  # decimals of the weights; further ones depend on the machine
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +31,10 @@ class Cells:
     def owners(self, places: np.ndarray) -> np.ndarray:
         """Return the cell [N] int64 of each point [N, 3]."""
         along = places.astype(np.float64) @ self.axes.T
-        found = np.full(len(places), -1, np.int64)
+        owner = np.full(len(places), -1, np.int64)
         for cell in range(len(self)):
-            found[((along >= self.low[cell]) & (along < self.high[cell])).all(axis=1)] = cell
-        return found
+            owner[((along >= self.low[cell]) & (along < self.high[cell])).all(axis=1)] = cell
+        return owner
 
     def near(self, cell: int, places: np.ndarray) -> np.ndarray:
         """Return which points [N, 3] lie in a cell or its margin, [N] bool."""
@@ -120,8 +120,8 @@ def cut(places: np.ndarray, weights: np.ndarray, axes: np.ndarray, grid: Sequenc
     ``places`` [N, 3] of weight 0 [N] are ignored. ``axes`` [A, 3] has one axis for each of the A numbers of ``grid``;
     ``margin`` is a fraction of the mean side of a cell.
     """
-    seen = weights > 0
-    along, weights = places[seen].astype(np.float64) @ axes.T, np.round(weights[seen] / weights.max(), _DIGITS)
+    visible = weights > 0
+    along, weights = places[visible].astype(np.float64) @ axes.T, np.round(weights[visible] / weights.max(), _DIGITS)
     cells: list[tuple[list[float], list[float], str, np.ndarray]] = [([], [], "", np.arange(len(along)))]
     lengths: list[list[float]] = [[] for _ in grid]
     for axis, count in enumerate(grid):

@@ -1,7 +1,7 @@
 """Runs tasks on the machines of a Ray cluster with a shared disk.
 
 Ray selects the machine of a task and repeats tasks of lost machines. Files are on the shared disk; Ray transfers only
-the tasks, their events and their outcomes, a few hundred bytes each.
+the tasks, their events and their results, a few hundred bytes each.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gs2d.core.extras import install
 from gs2d.errors import BackendError
 from gs2d.training.events import Event, Notice, NotMade, OnEvent, Phase, StageScored, Step
 
-RETRIES = 2  # least number, of a task whose machine or process is lost
+RETRIES = 2  # minimum for a task whose machine or process is lost
 CONNECT_SECONDS, TCP_SECONDS = 60.0, 5.0
 POLL_SECONDS, GOODBYE_SECONDS = 0.5, 15.0
 # ray.init tries for minutes in C++ and cannot be interrupted, so it is tried in another process first.
@@ -121,8 +121,8 @@ class Shares:
     def of(self, task: Task) -> dict[str, Any]:
         """Return the resources of a task by Ray's names."""
         gpus = self.gpus if task.gpu else 0
-        found: dict[str, Any] = {"num_cpus": self.alone if task.alone else self.cores, "num_gpus": gpus}
-        return found if task.memory is None else {**found, "memory": int(task.memory * 2**30)}
+        resources: dict[str, Any] = {"num_cpus": self.alone if task.alone else self.cores, "num_gpus": gpus}
+        return resources if task.memory is None else {**resources, "memory": int(task.memory * 2**30)}
 
 
 def shares(
@@ -153,17 +153,17 @@ def _sum(nodes: Sequence[Mapping[str, float]], name: str) -> float:
     return sum(node.get(name, 0.0) for node in nodes)
 
 
-def check_room(nodes: Sequence[Mapping[str, float]], taken: Mapping[str, Any], name: str) -> None:
+def check_room(nodes: Sequence[Mapping[str, float]], resources: Mapping[str, Any], name: str) -> None:
     """Raise for a task that fits on no machine, for which Ray would wait forever."""
-    asked = {"CPU": taken["num_cpus"], "GPU": taken["num_gpus"], "memory": taken.get("memory", 0)}
-    if not any(all(node.get(key, 0) >= value for key, value in asked.items()) for node in nodes):
-        memory = f" and {asked['memory'] / 2**30:.3g} GiB" if asked["memory"] else ""
+    required = {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"], "memory": resources.get("memory", 0)}
+    if not any(all(node.get(key, 0) >= value for key, value in required.items()) for node in nodes):
+        memory = f" and {required['memory'] / 2**30:.3g} GiB" if required["memory"] else ""
         there = "; ".join(
             f"{node.get('CPU', 0):g} CPUs, {node.get('GPU', 0):g} GPUs, {node.get('memory', 0) / 2**30:.3g} GiB"
             for node in nodes
         )
         raise BackendError(
-            f"{name} fits on no machine of the cluster: it takes {asked['CPU']} CPUs, {asked['GPU']} GPUs"
+            f"{name} fits on no machine of the cluster: it takes {required['CPU']} CPUs, {required['GPU']} GPUs"
             f"{memory}, the machines have {there}; use fewer --threads or less --memory"
         )
 
@@ -176,10 +176,10 @@ def cluster_executor(
     ray, owned = connect(address)
     try:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        taken = shares(nodes, backend, slots, threads, address)
+        task_shares = shares(nodes, backend, slots, threads, address)
         for task in tasks:
-            check_room(nodes, taken.of(task), task.name)
-        return OnCluster(ray, folder, taken, slots or len(tasks), ray.shutdown if owned else lambda: None)
+            check_room(nodes, task_shares.of(task), task.name)
+        return OnCluster(ray, folder, task_shares, slots or len(tasks), ray.shutdown if owned else lambda: None)
     except BaseException:
         if owned:
             ray.shutdown()
@@ -189,11 +189,11 @@ def cluster_executor(
 class OnCluster(Executor[AnyTask]):
     """Runs each task as a Ray task in its own process."""
 
-    def __init__(self, ray: Any, folder: Path, taken: Shares, slots: int, leave: Callable[[], None]) -> None:
+    def __init__(self, ray: Any, folder: Path, task_shares: Shares, slots: int, leave: Callable[[], None]) -> None:
         from ray.util.queue import Queue
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        self._ray, self._folder, self._taken, self._slots, self._leave = ray, folder, taken, slots, leave
+        self._ray, self._folder, self._shares, self._slots, self._leave = ray, folder, task_shares, slots, leave
         ray.cloudpickle.register_pickle_by_value(cluster_worker)
         self._remote = ray.remote(max_calls=1)(cluster_worker.do_on_worker)
         # On this machine, as other machines can be lost.
@@ -204,19 +204,19 @@ class OnCluster(Executor[AnyTask]):
         self._token, self._stopped = secrets.token_hex(8), False
 
     def fitted(self, task: AnyTask) -> AnyTask:
-        """Return a task with the number of CPU threads that it gets."""
-        return task.with_threads(self._taken.of(task)["num_cpus"])
+        """Return a task with the number of CPU threads of its resources."""
+        return task.with_threads(self._shares.of(task)["num_cpus"])
 
     def running(self) -> Sequence[AnyTask]:
-        """Return the tasks that were given to Ray, including waiting ones."""
+        """Return the tasks that were submitted to Ray, including waiting ones."""
         return list(self._running.values())
 
     def has_room(self) -> bool:
-        """Return whether another task can be given to Ray, where it may wait."""
+        """Return whether another task can be submitted to Ray, where it may wait."""
         return len(self._running) < self._slots
 
     def start(self, task: AnyTask) -> None:
-        """Give a task to Ray."""
+        """Submit a task to Ray."""
         token_file(self._folder, self._token).touch()
         order = {
             "name": task.name,
@@ -230,7 +230,7 @@ class OnCluster(Executor[AnyTask]):
             name=task.name,
             max_retries=_retries(task),
             scheduling_strategy="SPREAD",
-            **self._taken.of(task),
+            **self._shares.of(task),
         )
         self._running[remote.remote(order, self._queue)] = task
 
@@ -239,7 +239,7 @@ class OnCluster(Executor[AnyTask]):
         refs = list(self._running)
         self._ray.wait(refs, num_returns=1, timeout=POLL_SECONDS)
         ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
-        for name, event in self._told():
+        for name, event in self._new_events():
             self._pass_on(name, event, on_event)
         for ref, task in self._running.items():  # Ray restarts tasks without memory forever
             if ref not in ready and self._progress.get(task.name, TaskProgress()).begun > 1 + _retries(task):
@@ -247,25 +247,25 @@ class OnCluster(Executor[AnyTask]):
         ended = []
         for ref in ready:
             task = self._running[ref]
-            outcome = self._outcome(ref, task)
-            if outcome["state"] == "refused":
-                raise BackendError(outcome["reason"])
+            status = self._status(ref, task)
+            if status["state"] == "refused":
+                raise BackendError(status["reason"])
             del self._running[ref]
             self._progress.pop(task.name, None)
             with contextlib.suppress(OSError):
                 os.listdir(task.record.parent)  # refreshes the cache of NFS
-            if "reason" in outcome:
-                on_event(Notice(f"{task.name} failed: {outcome['reason']}"))
-            ended.append((task, outcome["state"] == "failed"))
+            if "reason" in status:
+                on_event(Notice(f"{task.name} failed: {status['reason']}"))
+            ended.append((task, status["state"] == "failed"))
         return ended
 
-    def _told(self) -> list[tuple[str, Event | Begun]]:
+    def _new_events(self) -> list[tuple[str, Event | Begun]]:
         """Return the events of tasks since the last call."""
         size = self._queue.size()
         return list(self._queue.get_nowait_batch(size)) if size else []
 
-    def _outcome(self, ref: Any, task: AnyTask) -> dict[str, Any]:
-        """Return the outcome of a task that has ended."""
+    def _status(self, ref: Any, task: AnyTask) -> dict[str, Any]:
+        """Return the status of a task that has ended."""
         try:
             return dict(self._ray.get(ref))
         except Exception as error:  # its last machine was lost, or it could not start
@@ -273,8 +273,8 @@ class OnCluster(Executor[AnyTask]):
             lost = "its process or machine was lost repeatedly, or ran out of memory"
             words = " ".join(str(error).split())[-200:]
             reason = f"{lost} ({kind})" if kind in LOST else f"{kind}: {words}"
-            task.write("failed", reason=reason, **task.facts())
-            return task.outcome()
+            task.write("failed", reason=reason, **task.details())
+            return task.status()
 
     def _pass_on(self, name: str, event: Event | Begun, on_event: OnEvent) -> None:
         """Pass on an event of a task, with the name of the task."""
@@ -331,7 +331,7 @@ def _retries(task: Task) -> int:
 
 @dataclass
 class TaskProgress:
-    """How far a task is, on which machine."""
+    """Progress of a task and the machine it runs on."""
 
     host: str = ""
     begun: int = 0
@@ -340,7 +340,7 @@ class TaskProgress:
     done: int = 0
 
     def words(self) -> str:
-        """Return it in a few words: `` (surface 40 %)``."""
+        """Return the progress as text: `` (surface 40 %)``."""
         if not self.phase:
             return ""
         return f" ({self.phase} {100 * self.done // self.total} %)" if self.total else f" ({self.phase})"

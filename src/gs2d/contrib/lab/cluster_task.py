@@ -1,4 +1,4 @@
-"""Runs a task in a process of a cluster: waits for files, sends events, returns the outcome."""
+"""Runs a task in a process of a cluster: waits for files, sends events, returns its status."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ def do_order(order: dict[str, Any], queue: Any, host: str) -> dict[str, Any]:
             "all machines have at the same path",
         }
     task: Task = pickle.loads(order["task"])
-    tell = Told(task.name, queue)
-    tell.send(Begun(host))
+    events = EventSender(task.name, queue)
+    events.send(Begun(host))
     lock = task.record.with_suffix(".lock")
     with open(lock, "a+b") as file:
         # A process of a disconnected machine may still be working.
         if not _within(WAIT_SECONDS, lambda: try_lock(file.fileno())):
-            return {"state": "failed", "reason": f"another process of the cluster still works on it (it holds {lock})"}
-        _within(WAIT_SECONDS, lambda: all(path.exists() for path in task.inputs))  # what is missing says the task
+            return {"state": "failed", "reason": f"another process of the cluster still works on it (lock: {lock})"}
+        _within(WAIT_SECONDS, lambda: all(path.exists() for path in task.inputs))  # the task reports missing files
         if not task.is_done():  # recorded by a process whose machine was lost
-            do(task, tell)
-        return {"state": "done"} | task.outcome()
+            do(task, events)
+        return {"state": "done"} | task.status()
 
 
 def _within(seconds: float, is_so: Callable[[], bool]) -> bool:
@@ -64,7 +64,7 @@ def _within(seconds: float, is_so: Callable[[], bool]) -> bool:
 
 
 @dataclass
-class Told:
+class EventSender:
     """Passes on the events of a task: steps once a second, others at once."""
 
     name: str
@@ -80,7 +80,7 @@ class Told:
         if isinstance(event, Phase | Step | Notice | StageScored):
             self.send(event)
         elif isinstance(event, NotMade):
-            self.send(replace(event, error=None))  # which need not survive the way
+            self.send(replace(event, error=None))  # exceptions may not be picklable
 
     def send(self, event: Event | Begun) -> None:
         """Send an event; errors are ignored, so that the task continues."""

@@ -31,7 +31,7 @@ def do_on_worker(order: dict[str, Any], queue: Any) -> dict[str, Any]:
             "reason": f"{here} of the cluster has gs2d {gs2d.__version__}, this command {order['version']}; "
             "install the same version on all machines",
         }
-    with contextlib.suppress(OSError):  # whole paths need none
+    with contextlib.suppress(OSError):  # absolute paths do not depend on it
         os.chdir(order["cwd"])
     from gs2d.contrib.lab.cluster_task import do_order
 

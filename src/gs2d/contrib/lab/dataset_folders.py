@@ -17,7 +17,7 @@ from gs2d.contrib.lab.datasets import (
     NERF_SYNTHETIC_SCENES,
     TNT_SCENES,
     DataSet,
-    SceneFacts,
+    SceneInfo,
 )
 from gs2d.contrib.lab.visible_surface import MESH_TRUTHS
 from gs2d.core.image_arrays import is_number
@@ -153,7 +153,7 @@ _TRUTH_SOURCES = {
 }
 
 
-def recognise(root: Path, truth: Path | None = None) -> tuple[DataSet, SceneFacts] | None:
+def recognise(root: Path, truth: Path | None = None) -> tuple[DataSet, SceneInfo] | None:
     """Return the data set and scene of a capture, by the name of its folder and its files; None for other captures.
 
     COLMAP captures need more than a name, as many are called garden or truck: Tanks and Temples the camera log beside
@@ -162,15 +162,15 @@ def recognise(root: Path, truth: Path | None = None) -> tuple[DataSet, SceneFact
     """
     root = Path(os.path.abspath(root))  # "." has no name; a link keeps its own
     for dataset in DATASETS.values():
-        for facts in dataset.scenes:
-            if _is_scene(dataset, facts, root) and (
-                dataset.name not in _COLMAP or _is_proven(dataset, facts, root, truth)
+        for info in dataset.scenes:
+            if _is_scene(dataset, info, root) and (
+                dataset.name not in _COLMAP or _is_proven(dataset, info, root, truth)
             ):
-                return dataset, facts
+                return dataset, info
     scan = re.search(r"scan_?(\d+)$", root.name.lower())
     if scan and has_dtu_cameras(root):  # a scan that is not in the tables
         number = int(scan.group(1))
-        return DTU_SCENES, SceneFacts(f"scan{number}", "dtu", 2, scan=number)
+        return DTU_SCENES, SceneInfo(f"scan{number}", "dtu", 2, scan=number)
     return None
 
 
@@ -179,10 +179,10 @@ def missing_lines(root: Path) -> tuple[str, ...]:
 
     Returns () for other captures, and for lists of views that are broken, which their reader reports.
     """
-    known = recognise(root)
-    if known is None:
+    match = recognise(root)
+    if match is None:
         return ()
-    dataset, facts = known
+    dataset, info = match
     source = _capture_source(dataset)
     try:
         if dataset is DTU_SCENES:
@@ -190,17 +190,17 @@ def missing_lines(root: Path) -> tuple[str, ...]:
         elif dataset is NERF_SYNTHETIC_SCENES:
             pieces = _blender_pieces(root, source)
         else:
-            pieces = _colmap_pieces(root, facts.images, source)
+            pieces = _colmap_pieces(root, info.images, source)
     except DataError:
         return ()
-    if dataset is TNT_SCENES and not (log := published_log(root, facts.name)).is_file():
+    if dataset is TNT_SCENES and not (log := published_log(root, info.name)).is_file():
         pieces.append(MissingPiece(log, "only to check the frame", source))
     folders = (piece if piece.path.parent.is_dir() else replace(piece, path=piece.path.parent) for piece in pieces)
     return tuple(dict.fromkeys(piece.line() for piece in folders))
 
 
 def find_truth(
-    dataset: DataSet, facts: SceneFacts, root: Path, folder: Path | None = None
+    dataset: DataSet, info: SceneInfo, root: Path, folder: Path | None = None
 ) -> tuple[dict[str, Path], tuple[MissingPiece, ...]]:
     """Return the files of a scene's ground truth, and the missing ones.
 
@@ -209,38 +209,38 @@ def find_truth(
     above = 2 if dataset.name == "dtu" else 3  # TNT_GOF/TrainingSet/Barn is deeper than DTU/scan24
     places = [folder] if folder is not None else [root, *root.parents[:above]]
     if dataset.name == "dtu":
-        names = dtu_truth_files(facts.scan or 0)
+        names = dtu_truth_files(info.scan or 0)
         near = [place for base in places for place in (base, *subfolders(base))]
         inside = [place for base in near for place in (base, base / "MVS Data", base / "SampleSet" / "MVS Data")]
-        found = {what: path for what, name in names.items() if (path := _first(inside, name)) is not None}
-        if found:  # where the others are
-            what, path = next(iter(found.items()))
-            places = [path.parents[names[what].count("/")]]
+        files = {kind: path for kind, name in names.items() if (path := _first(inside, name)) is not None}
+        if files:  # the missing ones belong beside it
+            kind, path = next(iter(files.items()))
+            places = [path.parents[names[kind].count("/")]]
     elif dataset.name == "tnt":
-        names = tnt_truth_files(facts.name)
+        names = tnt_truth_files(info.name)
         candidates = [
             place
             for base in places
-            for place in (base, base / facts.name, *(sub / facts.name for sub in subfolders(base)))
+            for place in (base, base / info.name, *(sub / info.name for sub in subfolders(base)))
         ]
         best = max(candidates, key=lambda place: _own_pieces(place, names))
         has_any = _own_pieces(best, names) > 0
-        found = {what: best / name for what, name in names.items() if has_any and (best / name).is_file()}
+        files = {kind: best / name for kind, name in names.items() if has_any and (best / name).is_file()}
         places = [best] if has_any else places
     elif dataset.name == "nerf-synthetic":
         names = {"mesh": MESH_TRUTHS[0]}
         at = folder if folder is not None else root
         mesh = next((at / name for name in MESH_TRUTHS if (at / name).is_file()), None)
-        found = {} if mesh is None else {"mesh": mesh}
+        files = {} if mesh is None else {"mesh": mesh}
         places = [at]
     else:
         return {}, ()
     lacking = tuple(
-        MissingPiece(places[0] / name, SCORING, _TRUTH_SOURCES[dataset.name, what])
-        for what, name in names.items()
-        if what not in found
+        MissingPiece(places[0] / name, SCORING, _TRUTH_SOURCES[dataset.name, kind])
+        for kind, name in names.items()
+        if kind not in files
     )
-    return found, lacking
+    return files, lacking
 
 
 def protocol_of(root: Path, scene_format: str, truth: Path | None = None) -> Protocol:
@@ -251,10 +251,10 @@ def protocol_of(root: Path, scene_format: str, truth: Path | None = None) -> Pro
 
 def known_protocol(root: Path, scene_format: str, truth: Path | None = None) -> str | None:
     """Return the name of the protocol of a scene of a known data set; None for other captures."""
-    known = recognise(root, truth)
-    if known is None or (known[0].name in _COLMAP) != (scene_format == "colmap"):
+    match = recognise(root, truth)
+    if match is None or (match[0].name in _COLMAP) != (scene_format == "colmap"):
         return None
-    return known[1].protocol
+    return match[1].protocol
 
 
 @DATA_SETS.register("paper")
@@ -295,10 +295,10 @@ def _own_pieces(place: Path, names: Mapping[str, str]) -> int:
     return 2 * own + (place / names["log"]).is_file() if own else 0
 
 
-def _is_scene(dataset: DataSet, facts: SceneFacts, root: Path) -> bool:
+def _is_scene(dataset: DataSet, info: SceneInfo, root: Path) -> bool:
     """Return whether a folder is a scene, by name (``scan24``, ``nerf_synthetic_lego``) and one characteristic file."""
     name = root.name.lower()
-    if name != facts.name.lower() and not name.endswith(f"_{facts.name.lower()}"):
+    if name != info.name.lower() and not name.endswith(f"_{info.name.lower()}"):
         return False
     if dataset is DTU_SCENES:
         return has_dtu_cameras(root) or any((root / n).is_dir() for n in ("image", "images"))
@@ -306,15 +306,15 @@ def _is_scene(dataset: DataSet, facts: SceneFacts, root: Path) -> bool:
         return any((root / f"transforms_{split}.json").is_file() for split in ("train", "test"))
     if not (root / "sparse").is_dir() and not (root / "images").is_dir():
         return False
-    return dataset is not MIP_NERF_360_SCENES or (root / "poses_bounds.npy").is_file() or (root / facts.images).is_dir()
+    return dataset is not MIP_NERF_360_SCENES or (root / "poses_bounds.npy").is_file() or (root / info.images).is_dir()
 
 
-def _is_proven(dataset: DataSet, facts: SceneFacts, root: Path, truth: Path | None) -> bool:
+def _is_proven(dataset: DataSet, info: SceneInfo, root: Path, truth: Path | None) -> bool:
     """Return whether a folder with the name of a scene is that scene of a data set of COLMAP captures."""
-    if root.name.lower() != facts.name.lower():
+    if root.name.lower() != info.name.lower():
         return False
     if dataset is TNT_SCENES:
-        return published_log(root, facts.name).is_file() or bool(find_truth(dataset, facts, root, truth)[0])
+        return published_log(root, info.name).is_file() or bool(find_truth(dataset, info, root, truth)[0])
     return (root / "poses_bounds.npy").is_file()
 
 

@@ -15,7 +15,7 @@ from gs2d.errors import ProtocolError
 
 
 @dataclass(frozen=True)
-class SceneFacts:
+class SceneInfo:
     """One scene of a data set."""
 
     name: str  # of the folder in the data set
@@ -32,10 +32,10 @@ class DataSet:
 
     name: str
     title: str
-    scenes: tuple[SceneFacts, ...]  # in the order of the paper's tables
+    scenes: tuple[SceneInfo, ...]  # in the order of the paper's tables
     evaluator: str  # of surfaces: "dtu", "tnt", "visible-surface", or "" without ground truth
 
-    def scene(self, name: str) -> SceneFacts:
+    def scene(self, name: str) -> SceneInfo:
         """Return the scene of a name, ignoring case, or raise ProtocolError."""
         for scene in self.scenes:
             if scene.name.lower() == name.lower():
@@ -47,7 +47,7 @@ _SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)  # [
 DTU_SCENES = DataSet(
     "dtu",
     "DTU",
-    tuple(SceneFacts(f"scan{n}", "dtu", 2, scan=n) for n in _SCANS),  # [s] -r 2
+    tuple(SceneInfo(f"scan{n}", "dtu", 2, scan=n) for n in _SCANS),  # [s] -r 2
     "dtu",
 )
 _TNT = {  # [tnt] tau, m; [s] the large scenes are fused coarser and farther
@@ -61,14 +61,14 @@ _TNT = {  # [tnt] tau, m; [s] the large scenes are fused coarser and farther
 TNT_SCENES = DataSet(
     "tnt",
     "Tanks and Temples",
-    tuple(SceneFacts(name, protocol, 2, tau=tau) for name, (tau, protocol) in _TNT.items()),  # [s] -r 2
+    tuple(SceneInfo(name, protocol, 2, tau=tau) for name, (tau, protocol) in _TNT.items()),  # [s] -r 2
     "tnt",
 )
 NERF_SYNTHETIC_SCENES = DataSet(
     "nerf-synthetic",
     "NeRF-Synthetic",
     tuple(  # [s] the eight scenes, 800 x 800
-        SceneFacts(name, "nerf-synthetic", 1, images="train")
+        SceneInfo(name, "nerf-synthetic", 1, images="train")
         for name in ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")
     ),
     "visible-surface",  # [d] no public protocol exists
@@ -78,8 +78,8 @@ _INDOOR = ("room", "counter", "kitchen", "bonsai")  # [m360], [s] images_2
 MIP_NERF_360_SCENES = DataSet(
     "mip-nerf-360",
     "Mip-NeRF 360",
-    tuple(SceneFacts(name, "mip-nerf-360", 4, images="images_4") for name in _OUTDOOR)
-    + tuple(SceneFacts(name, "mip-nerf-360", 2, images="images_2") for name in _INDOOR),
+    tuple(SceneInfo(name, "mip-nerf-360", 4, images="images_4") for name in _OUTDOOR)
+    + tuple(SceneInfo(name, "mip-nerf-360", 2, images="images_2") for name in _INDOOR),
     "",
 )
 DATASETS: Mapping[str, DataSet] = MappingProxyType(

@@ -10,58 +10,58 @@ from gs2d.config.schedule import scale_schedule
 from gs2d.contrib.lab.aggregate import NOT_YET, Results, surface_metric
 from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
-from gs2d.contrib.lab.scenes import FoundScene, missing_scenes, unreadable
+from gs2d.contrib.lab.scenes import SweepScene, missing_scenes, unreadable
 from gs2d.data.image_files import image_size
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import machine, versions
 
 NERF_SYNTHETIC_SIZE = (800, 800)  # px
-SHOWN_PIECES = 5  # that a capture lacks
+SHOWN_PIECES = 5  # missing files listed for each capture
 OFFICIAL_EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by data set
 
 
 def deviations_of(
-    options: SweepOptions, scenes: Sequence[FoundScene], table: PaperTable, results: Results
+    options: SweepOptions, scenes: Sequence[SweepScene], table: PaperTable, results: Results
 ) -> list[str]:
     """Return the known differences, the most important first."""
-    found = []
+    lines = []
     if options.schedule_scale != 1.0:
-        found.append(f"the schedule is {options.schedule_scale:g} of the paper's (30k + 10k + 20k iterations)")
+        lines.append(f"the schedule is {options.schedule_scale:g} of the paper's (30k + 10k + 20k iterations)")
         full, scaled = opacity_resets(1.0), opacity_resets(options.schedule_scale)
         if full != scaled:
-            found.append(
+            lines.append(
                 f"opacity is reset {scaled} times in stage 1, in the paper {full} times: the interval is not scaled"
             )
         points = [scale_schedule(get_recipe("2dgs"), scale).init_points for scale in (1.0, options.schedule_scale)]
         if points[0] != points[1]:
-            found.append(f"captures without points start from {points[1]:,} random ones, not from {points[0]:,}")
-    found += _scenes(options, scenes, table)
-    found += [f"changed in the recipes: {text}" for text in options.overrides]
+            lines.append(f"captures without points start from {points[1]:,} random ones, not from {points[0]:,}")
+    lines += _scenes(options, scenes, table)
+    lines += [f"changed in the recipes: {text}" for text in options.overrides]
     if table.of_paper:
-        found += _methods(table, scenes)
-        found += _weights(table, scenes)
-    found += _missing_figures(results)
+        lines += _methods(table, scenes)
+        lines += _weights(table, scenes)
+    lines += _missing_figures(results)
     if any(scene.data_set == NERF_SYNTHETIC and scene.scored for scene in scenes):
-        found.append(
+        lines.append(
             "F-score on NeRF-Synthetic is by this project's own protocol, at 0.25 % of the true diagonal: the paper "
             "states none"
         )
-    found += dict.fromkeys(_surfaces(results))
+    lines += dict.fromkeys(_surfaces(results))
     if options.slots is not None and options.slots > 1:
-        found.append(f"{options.slots} runs shared the machine: their seconds are longer than those of one alone")
+        lines.append(f"{options.slots} runs shared the machine: their seconds are longer than those of one alone")
     count, names = len(options.seeds), ", ".join(map(str, options.seeds))
     unsaid = "; the paper does not say how many" if table.of_paper else ""
-    found.append(f"{count} seed{'s' if count > 1 else ''} ({names}){unsaid}")
+    lines.append(f"{count} seed{'s' if count > 1 else ''} ({names}){unsaid}")
     host, installed = machine(), versions()
     backends = ", ".join(
         sorted({cell.details["backend"] for row in results.rows for cell in row.cells if cell.details})
     )
-    found.append(
+    lines.append(
         f"machine: {host['processor']}, {host['cores']} cores, backend {backends or 'none yet'}"
         f"{' (paper: RTX 4090)' if table.of_paper else ''}; "
         f"gs2d {installed['2dgs-r']}, torch {installed['torch']}, Python {installed['python']}"
     )
-    return found
+    return lines
 
 
 def opacity_resets(scale: float) -> int:
@@ -71,7 +71,7 @@ def opacity_resets(scale: float) -> int:
     return sum(stage.densify.resets(i, white=False) for i in range(1, stage.iterations + 1))
 
 
-def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
+def _methods(table: PaperTable, scenes: Sequence[SweepScene]) -> Iterator[str]:
     """Yield details that the paper leaves open, and intended differences of gs2d."""
     yield (
         "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
@@ -105,13 +105,13 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
         )
 
 
-def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
+def _weights(table: PaperTable, scenes: Sequence[SweepScene]) -> Iterator[str]:
     """Yield scenes whose protocol sets a distortion weight other than the paper's "100/10"."""
     if not any("100/10" in row.name for row in table.rows):
         return
     weighed = [(s.name, s.protocol.loss_weights["distortion"]) for s in scenes if s.data_set != TNT]
     for weight in dict.fromkeys(weight for _, weight in weighed):
-        names = ", ".join(name for name, found in weighed if found == weight)
+        names = ", ".join(name for name, value in weighed if value == weight)
         yield f"{names}: alpha with distortion is {weight:g}, their protocol's; the paper's 100/10 is of TnT"
 
 
@@ -140,7 +140,7 @@ def _surfaces(results: Results) -> Iterator[str]:
         yield f"{scene}: do not believe the surface scores of {', '.join(runs)}: {why}"
 
 
-def _scenes(options: SweepOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
+def _scenes(options: SweepOptions, scenes: Sequence[SweepScene], table: PaperTable) -> Iterator[str]:
     """Return differences in images and scenes, and missing files."""
     if table.of_paper:
         yield from _other_scenes(scenes, table)
@@ -162,7 +162,7 @@ def _scenes(options: SweepOptions, scenes: Sequence[FoundScene], table: PaperTab
         yield from (f"{name} is not trained: {line}" for name, line in unreadable(options.data).items())
 
 
-def _other_scenes(scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
+def _other_scenes(scenes: Sequence[SweepScene], table: PaperTable) -> Iterator[str]:
     """Yield scenes that are not in the paper, and missing scenes of its data sets."""
     for data_set in dict.fromkeys(scene.data_set for scene in scenes):
         if data_set not in table.columns:
@@ -172,8 +172,8 @@ def _other_scenes(scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[s
         yield f"{data_set}: {len(absent)} of its {count} scenes are not here: {', '.join(absent)}"
 
 
-def _size(scene: FoundScene) -> tuple[int, int] | None:
-    """Of a photograph of a NeRF-Synthetic scene."""
+def _size(scene: SweepScene) -> tuple[int, int] | None:
+    """Return width and height of the first training image of a NeRF-Synthetic scene; None if it cannot be read."""
     path = next(iter(sorted((scene.path / "train").glob("*.png"))), None)
     try:
         return None if path is None else image_size(path)
@@ -183,7 +183,7 @@ def _size(scene: FoundScene) -> tuple[int, int] | None:
 
 def _missing_figures(results: Results) -> list[str]:
     """Return failed and missing runs, and figures without any value."""
-    found: list[str] = []
+    lines: list[str] = []
     waiting, failed = 0, dict[tuple[str, str], list[str]]()
     for row in results.rows:
         for cell in row.cells:
@@ -192,9 +192,9 @@ def _missing_figures(results: Results) -> list[str]:
                     waiting += 1
                 else:
                     failed.setdefault((cell.scene, cell.reasons["bytes"]), []).append(f"{row.name} (seed {cell.seed})")
-    found += [f"{scene}: failed for {', '.join(runs)}: {why}" for (scene, why), runs in failed.items()]
+    lines += [f"{scene}: failed for {', '.join(runs)}: {why}" for (scene, why), runs in failed.items()]
     if waiting:
-        found.append(f"{waiting} runs are not finished yet")
+        lines.append(f"{waiting} runs are not finished yet")
     for data_set in results.data_sets:
         for metric in ("lpips", surface_metric(results.rows, data_set)):
             cells = [cell for row in results.rows for cell in row.of(data_set) if cell.figures["bytes"] is not None]
@@ -202,5 +202,5 @@ def _missing_figures(results: Results) -> list[str]:
             reasons = sorted({cell.reasons.get(metric, "") for cell in lacking})
             if lacking:
                 some = "" if len(lacking) == len(cells) else f" of {len(lacking)} runs"
-                found.append(f"{data_set}: no {METRICS[metric]}{some} ({'; '.join(reasons)})")
-    return found
+                lines.append(f"{data_set}: no {METRICS[metric]}{some} ({'; '.join(reasons)})")
+    return lines

@@ -99,7 +99,7 @@ class DtuReader:
     before_colmap = True
 
     def detect(self, path: Path) -> bool:
-        """Whether the folder has projection matrices."""
+        """Return whether the folder has projection matrices."""
         return bool(camera_archives(path))
 
     def read(self, path: Path, *, downscale: int) -> Capture:
@@ -109,10 +109,11 @@ class DtuReader:
 
 def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:
     """Return the observations of the model by image name of the scan, whose suffix may differ."""
-    found = observed_points(model.folder, model.kind)
+    observations = observed_points(model.folder, model.kind)
     by_stem = {Path(frame.name).stem: frame.name for frame in frames}
-    seen = {by_stem[Path(name).stem]: rows for name, rows in found.by_view.items() if Path(name).stem in by_stem}
-    return replace(found, by_view=seen)
+    named = observations.by_view.items()
+    by_view = {by_stem[stem]: rows for name, rows in named if (stem := Path(name).stem) in by_stem}
+    return replace(observations, by_view=by_view)
 
 
 def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float, float, np.ndarray]:
@@ -159,13 +160,13 @@ def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
     if not masks:
         return ()
     path, world, scale = _matrices_of(root, _read_model(root))
-    found = []
+    silhouettes = []
     for index, mask in zip(_view_indices(masks, sorted(world), path), masks, strict=True):
         if index in world:
             width, height = image_size(mask)
             fx, fy, cx, cy, T = decompose_projection(world[index] @ scale[index], f"{path}: view {index}")
-            found.append(DtuSilhouette(Camera(width, height, fx, fy, cx + 0.5, cy + 0.5, T), mask))
-    return tuple(found)
+            silhouettes.append(DtuSilhouette(Camera(width, height, fx, fy, cx + 0.5, cy + 0.5, T), mask))
+    return tuple(silhouettes)
 
 
 def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.ndarray], dict[int, np.ndarray]]:
@@ -218,8 +219,8 @@ def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndar
 def _files(root: Path, names: Sequence[str]) -> list[Path]:
     for name in names:
         if (folder := in_any_case(root, name)).is_dir():
-            found = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES]
-            return sorted(found, key=lambda path: natural_key(path.name))
+            files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES]
+            return sorted(files, key=lambda path: natural_key(path.name))
     return []
 
 
@@ -260,7 +261,7 @@ def _center(T: np.ndarray) -> np.ndarray:
 
 
 def _same_places(centers: dict[str, np.ndarray], model: _Model) -> bool:
-    """Whether the model has the same camera centres, within 2 % of their spread."""
+    """Return whether the model has the same camera centres, within 2 % of their spread."""
     theirs = {Path(name).stem: _center(image.T_cam_world) for name, image in model.images.items()}
     common = sorted(set(centers) & set(theirs))
     if not common:

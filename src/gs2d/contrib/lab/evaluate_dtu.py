@@ -1,8 +1,8 @@
 """Chamfer distance of DTU (Jensen et al. 2014), in the steps of the Python evaluation that 2DGS uses.
 
-1. The mesh loses what lies outside any view's silhouette (widened by 24 px), and goes to millimetres by scale_mat.
-2. Points on it about 0.2 mm apart, thinned until no two are nearer than 0.2 mm. The official script shuffles with an
-   unseeded generator first; ours is seeded, so a score can be repeated.
+1. The mesh is culled by the silhouettes of all views (widened by 24 px), and scaled to millimetres by scale_mat.
+2. It is sampled about every 0.2 mm, and the points are thinned until no two are nearer than 0.2 mm. The official script
+   shuffles them with an unseeded generator; ours is seeded, so that scores are reproducible.
 3. Reconstruction to scan: points inside the widened bounding box and the observation mask. Scan to reconstruction:
    scanned points above the plane of the table, to the points inside the box (observed or not).
 4. Distances of 20 mm and more are dropped; the score is the mean of both means.
@@ -74,15 +74,15 @@ def read_dtu_truth(scan: int, files: Mapping[str, Path]) -> DtuTruth:
     return DtuTruth(scan, points, observed.astype(bool), bounds, resolution, plane)
 
 
-# scipy's reader ends the process on some damaged files, so it has one of its own. A value takes at most 8 bytes.
+# scipy's reader crashes on some damaged files, so it runs in its own process. A value takes at most 8 bytes.
 _MATLAB = """
 import math, sys, numpy, scipy.io
 path, names = sys.argv[1], sys.argv[2:]
 if sum(math.prod(shape) for name, shape, _ in scipy.io.whosmat(path) if name in names) > 1 << 29:
     raise ValueError("arrays of more than 500 million values")
-found = scipy.io.loadmat(path, variable_names=names)
-found = {name: array for name, array in found.items() if getattr(array, "dtype", numpy.dtype("O")).kind in "biuf"}
-numpy.savez(sys.stdout.buffer, **found)
+data = scipy.io.loadmat(path, variable_names=names)
+data = {name: array for name, array in data.items() if getattr(array, "dtype", numpy.dtype("O")).kind in "biuf"}
+numpy.savez(sys.stdout.buffer, **data)
 """
 
 
@@ -262,44 +262,44 @@ def _half_steps(n1: int, n2: int) -> np.ndarray:
 
 
 def thin(points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _SLAB) -> np.ndarray:
-    """Thin points to a minimum distance ``radius``; every dropped point is within it of a kept one.
+    """Thin points to a minimum distance ``radius``; every dropped point is within it of a selected one.
 
-    Points are taken greedily: slab by slab along the longest axis, in an order shuffled from the seed within a slab.
-    Within a slab, all points that precede their neighbours are taken at once, repeatedly, which gives the same set.
+    Points are selected greedily: slab by slab along the longest axis, in an order shuffled from the seed within a slab.
+    Within a slab, all points that precede their neighbours are selected at once, repeatedly, which gives the same set.
     """
     if not len(points):
         return points
     axis = int(np.ptp(points, axis=0).argmax())
     points = points[np.argsort(points[:, axis], kind="stable")]
     rng = np.random.default_rng(seed)
-    kept: list[np.ndarray] = []
+    thinned: list[np.ndarray] = []
     for start in range(0, len(points), slab_size):
         slab = points[start : start + slab_size]
         reach = slab[0, axis] - radius
         slab = slab[rng.permutation(len(slab))]
-        near = [part[part[:, axis] >= reach] for part in kept if part[:, axis].max() >= reach]
+        near = [part[part[:, axis] >= reach] for part in thinned if part[:, axis].max() >= reach]
         if near:  # points of earlier slabs that reach into this one
             gap, _ = cKDTree(np.concatenate(near)).query(slab, distance_upper_bound=np.nextafter(radius, np.inf))
             slab = slab[~(gap <= radius)]
         if len(slab):
-            kept.append(slab[_first_of_neighbours(slab, radius)])
-    return np.concatenate(kept)
+            thinned.append(slab[_first_of_neighbours(slab, radius)])
+    return np.concatenate(thinned)
 
 
 def _first_of_neighbours(points: np.ndarray, radius: float) -> np.ndarray:
-    """Return which points a greedy choice in their order takes, bool [P]."""
-    taken = np.zeros(len(points), bool)
+    """Return the mask [P] of the points that a greedy choice in their order selects."""
+    selected = np.zeros(len(points), bool)
     if not len(points):
-        return taken
+        return selected
     open_ = np.ones(len(points), bool)
     pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")  # i < j in each
     while True:
         later = np.zeros(len(points), bool)
         later[pairs[:, 1]] = True
         chosen = open_ & ~later
-        taken |= chosen
+        selected |= chosen
         if not len(pairs):
-            return taken
+            return selected
         gone = chosen.copy()
         gone[pairs[chosen[pairs[:, 0]], 1]] = True
         open_ &= ~gone

@@ -1,11 +1,11 @@
 """Precision, recall and F-score of Tanks and Temples (Knapitsch et al. 2017), in the official steps.
 
-1. Point set of the reconstruction: mesh vertices and face centroids, as the official script takes them (so the score
-   depends on the triangulation, not on area alone).
-2. Start: the similarity that takes the capture's camera centres to those of the official log, moved into the scan's
-   frame by ``_trans.txt``. Our own cameras are used, never a second trajectory file that may be in another frame.
-3. Three stages of iterative closest points with scale, both clouds cut to the crop volume.
-4. Both clouds cut and thinned to tau / 2; precision and recall are the parts nearer than tau.
+1. The points of the reconstruction are mesh vertices and face centroids, as in the official script. The score
+   therefore depends on the triangulation, not on area alone.
+2. The initial alignment is the similarity from the capture's camera centres to those of the official log, moved into
+   the scan's frame by ``_trans.txt``. It uses our own cameras, as a second trajectory file may be in another frame.
+3. Three stages of iterative closest points with scale refine it, with both clouds cut to the crop volume.
+4. Both clouds are cut and thinned to tau / 2. Precision and recall are the fractions nearer than tau.
 
 A self-check tests the alignment: a wrong log or transform gives a low score, not an error.
 """

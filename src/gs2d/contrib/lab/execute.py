@@ -85,7 +85,7 @@ def execute(
             if not given_up(task, failed, on_event):
                 on_event(Notice(f"task {number} of {len(todo)}: {task.name}"))
                 do(task, on_event)
-            failed |= {task.name} if task.outcome()["state"] == "failed" else set()
+            failed |= {task.name} if task.status()["state"] == "failed" else set()
             after_task(task)
 
 
@@ -151,10 +151,10 @@ class Processes(Executor[AnyTask]):
 
     def stop(self) -> None:
         """End all processes."""
-        left = [process for _, process in self._running.values()]
-        for process in left:
+        processes = [process for _, process in self._running.values()]
+        for process in processes:
             process.terminate()
-        for process in left:
+        for process in processes:
             process.join(timeout=10)
 
 
@@ -164,13 +164,13 @@ def _how(code: int) -> str:
 
 def _has_failed(task: Task, code: int, on_event: OnEvent) -> bool:
     """Return whether a task whose process has ended has failed; report the failure."""
-    outcome = task.outcome()
-    if outcome["state"] not in ("done", "failed"):
-        task.write("failed", reason=f"its process died ({_how(code)}; out of memory?)", **task.facts())
-        outcome = task.outcome()
-    if "reason" in outcome:
-        on_event(Notice(f"{task.name} failed: {outcome['reason']}"))
-    return outcome["state"] == "failed"
+    status = task.status()
+    if status["state"] not in ("done", "failed"):
+        task.write("failed", reason=f"its process died ({_how(code)}; out of memory?)", **task.details())
+        status = task.status()
+    if "reason" in status:
+        on_event(Notice(f"{task.name} failed: {status['reason']}"))
+    return status["state"] == "failed"
 
 
 def _do_here(task: Task, device: str | None) -> None:

@@ -75,16 +75,16 @@ def _split(words: Iterable[str]) -> tuple[str, ...]:
 
 def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
     """Return seeds from ``0,1,2`` or ``0 1 2``; a single number n > 0 stands for seeds 0 to n - 1."""
-    given = tuple(words)
-    if all(isinstance(seed, int) for seed in given):
-        return tuple(map(int, given))
-    parts = _split(map(str, given))
+    seeds = tuple(words)
+    if all(isinstance(seed, int) for seed in seeds):
+        return tuple(map(int, seeds))
+    parts = _split(map(str, seeds))
     if not parts or not all(part.isdecimal() for part in parts):
         raise RecipeError(
-            f"--seeds must be whole numbers like 0,1,2, or a count like 3, got {' '.join(map(str, given)) or 'nothing'}"
+            f"--seeds must be whole numbers like 0,1,2, or a count like 3, got {' '.join(map(str, seeds)) or 'nothing'}"
         )
     numbers = tuple(int(part) for part in parts)
-    listed = len(numbers) > 1 or "," in str(given[0]) or numbers == (0,)
+    listed = len(numbers) > 1 or "," in str(seeds[0]) or numbers == (0,)
     return numbers if listed else tuple(range(numbers[0]))
 
 

@@ -69,8 +69,8 @@ def write_merged(settled: LoadedRun, options: TrainOptions, partition: Partition
 
 def read_seam_views(out: Path) -> tuple[str, ...]:
     """Return the views that show the seams of the merged scene, or raise DataError or RunError."""
-    found = read_json(out / SEAM_VIEWS)
-    views = found.get("views") if isinstance(found, dict) else None
+    data = read_json(out / SEAM_VIEWS)
+    views = data.get("views") if isinstance(data, dict) else None
     if not isinstance(views, list) or not all(isinstance(view, str) for view in views):
         raise RunError(f"{out / SEAM_VIEWS} must list views by name, got something else; delete it, and {MERGED} too")
     return tuple(views)

@@ -15,7 +15,7 @@ from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import SWEEP, SweepOptions
 from gs2d.contrib.lab.paper_tables import DTU, TNT, PaperRow, PaperTable
 from gs2d.contrib.lab.render import to_markdown, write_page
-from gs2d.contrib.lab.scenes import FoundScene
+from gs2d.contrib.lab.scenes import SweepScene
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
 from gs2d.contrib.lab.table_plan import Plan, commands_of, make_plan, paper_command
 from gs2d.contrib.lab.tasks import failures
@@ -47,10 +47,10 @@ def paper(options: SweepOptions, on_event: OnEvent = ignore) -> PaperResult:
 
     Cells of a failed run are empty, with the reason; other runs continue.
     """
-    asked = make_plan(options)
-    check_folder(asked)
-    plan = with_other_rows(asked)
-    others = [row.name for row in plan.table.rows if row not in asked.table.rows]
+    requested = make_plan(options)
+    check_folder(requested)
+    plan = with_other_rows(requested)
+    others = [row.name for row in plan.table.rows if row not in requested.table.rows]
     if others:
         on_event(Notice(f"{options.out} has rows of earlier commands, which stay: {', '.join(others)}"))
     if options.train:
@@ -74,10 +74,10 @@ def with_other_rows(plan: Plan) -> Plan:
     options, path = plan.options, plan.options.out / ABOUT
     if options.table != SWEEP or not path.exists():
         return plan
-    found = _about(path).get("recipes")
-    if not isinstance(found, list):
-        raise RunError(f"{path} must list the recipes of its sweep, got {found!r}; choose another --out")
-    names = tuple(dict.fromkeys([*map(str, found), *options.recipes]))
+    recipes = _about(path).get("recipes")
+    if not isinstance(recipes, list):
+        raise RunError(f"{path} must list the recipes of its sweep, got {recipes!r}; choose another --out")
+    names = tuple(dict.fromkeys([*map(str, recipes), *options.recipes]))
     return plan if names == options.recipes else make_plan(replace(options, recipes=names))
 
 
@@ -94,16 +94,16 @@ def check_folder(plan: Plan) -> None:
     for name, value in after.items():
         if before.get(name) != value:
             raise RunError(
-                f"{plan.options.out} holds a table made with {name} = {before.get(name)}, now {value}; "
+                f"{plan.options.out} has a table made with {name} = {before.get(name)}, now {value}; "
                 "choose another --out (--set cache=may stay: stages that are the same are taken from there)"
             )
 
 
 def _about(path: Path) -> dict[str, Any]:
     """Return the content of ``about.json``."""
-    found = read_json(path)
-    if isinstance(found, dict):
-        return found
+    data = read_json(path)
+    if isinstance(data, dict):
+        return data
     raise RunError(f"{path} must be one that gs2d sweep wrote, got another file; choose another --out")
 
 
@@ -114,20 +114,20 @@ def _defining(options: SweepOptions) -> dict[str, Any]:
 # -- tabulating ------------------------------------------------------------------------------------------------------
 def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> PaperResult:
     """Write table.json, table.md, about.json and, with images, index.html from the finished runs."""
-    unfinished = sum(task.outcome()["state"] not in ("done", "failed") for task in plan.tasks)
+    unfinished = sum(task.status()["state"] not in ("done", "failed") for task in plan.tasks)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     checked = check_claims(plan.table, results)
     deviations = deviations_of(plan.options, plan.scenes, plan.table, results)
-    out, facts = plan.options.out, about(plan, results, checked)
+    out, description = plan.options.out, about(plan, results, checked)
     make_folder(out)
     commands = [line for task in plan.tasks for line in commands_of(task)]
     write_json(out / "table.json", [row_json(row, results, deviations) for row in results.rows])
-    write_json(out / ABOUT, {**facts, "deviations": deviations})
+    write_json(out / ABOUT, {**description, "deviations": deviations})
     with atomic_write(out / "table.md", "w") as file:
-        file.write(to_markdown(plan.table, results, checked, deviations, [facts["command"], *commands]))
+        file.write(to_markdown(plan.table, results, checked, deviations, [description["command"], *commands]))
     files = [out / name for name in ("table.json", "table.md", ABOUT)]
     if images:
-        files.append(write_page(plan.table, results, checked, deviations, commands, facts, out))
+        files.append(write_page(plan.table, results, checked, deviations, commands, description, out))
     return PaperResult(plan.table, tuple(files), results, checked, failures(plan.tasks), unfinished)
 
 
@@ -143,7 +143,7 @@ def _row(plan: Plan, row: PaperRow) -> Row:
                     data_set=scene.data_set,
                     seed=seed,
                     test_on=scene.protocol.test_on,
-                    record=task.outcome(),
+                    record=task.status(),
                     conventions=scene.protocol.metrics,
                 )
             )
@@ -179,7 +179,7 @@ def about(plan: Plan, results: Results | None, checked: Sequence[ClaimResult]) -
         "recipes": [row.recipe for row in plan.table.trained],
         "options": _defining(options),
         "data": str(options.data),
-        "scenes": {scene.name: {"data_set": scene.data_set, **_scene_facts(scene)} for scene in plan.scenes},
+        "scenes": {scene.name: {"data_set": scene.data_set, **_scene_entry(scene)} for scene in plan.scenes},
         "protocols": {name: numbers_of(protocol) for name, protocol in _protocols(plan).items()},
         "seeds": list(options.seeds),
         "spread": "standard deviation over seeds of the mean over scenes",
@@ -194,25 +194,25 @@ def about(plan: Plan, results: Results | None, checked: Sequence[ClaimResult]) -
 
 def _protocols(plan: Plan) -> dict[str, Any]:
     """Return the protocols of scenes and of surface scores."""
-    found: dict[str, Any] = {scene.protocol.name: scene.protocol for scene in plan.scenes}
+    protocols: dict[str, Any] = {scene.protocol.name: scene.protocol for scene in plan.scenes}
     surfaces = {DTU: ("surface: dtu", DTU_SURFACE), TNT: ("surface: tnt", TNT_SURFACE)}
     for scene in plan.scenes:
         if scene.scored:
             name, protocol = surfaces.get(scene.data_set, ("surface: visible", VISIBLE_SURFACE))
-            found[name] = protocol
-    return found
+            protocols[name] = protocol
+    return protocols
 
 
 def numbers_of(protocol: Any, within: str = "") -> dict[str, str]:
     """Return the numbers of a protocol as text by field name, with dots for nested fields."""
-    found: dict[str, str] = {}
+    numbers: dict[str, str] = {}
     for field in fields(protocol):
         value, name = getattr(protocol, field.name), within + field.name
         if is_dataclass(value):
-            found |= numbers_of(value, f"{name}.")
+            numbers |= numbers_of(value, f"{name}.")
         elif name != "name":
-            found[name] = _words(value)
-    return found
+            numbers[name] = _words(value)
+    return numbers
 
 
 def _words(value: Any) -> str:
@@ -223,7 +223,7 @@ def _words(value: Any) -> str:
     return "; ".join(map(_words, value)) if isinstance(value, tuple) else str(value)
 
 
-def _scene_facts(scene: FoundScene) -> dict[str, Any]:
+def _scene_entry(scene: SweepScene) -> dict[str, Any]:
     truth = "found beside it" if scene.scored and scene.truth is None else scene.truth and str(scene.truth)
-    facts = {"path": str(scene.path), "format": scene.format, "downscale": scene.downscale, "ground_truth": truth}
-    return {**facts, "missing": list(scene.missing), "protocol": asdict(scene.protocol)}
+    entry = {"path": str(scene.path), "format": scene.format, "downscale": scene.downscale, "ground_truth": truth}
+    return {**entry, "missing": list(scene.missing), "protocol": asdict(scene.protocol)}

@@ -70,7 +70,7 @@ class PaperTable:
 
     @property
     def command(self) -> str:
-        """What makes it."""
+        """Return the command that makes the table."""
         return f"gs2d sweep {self.name}" if self.of_paper else "gs2d sweep"
 
 

@@ -124,9 +124,9 @@ def make_partition(blocks: str, changes: Sequence[str] = ()) -> Partition:
         for word in path:
             node = node.get(word) if isinstance(node, dict) else None
         if not equals or not isinstance(node, dict) or last not in node or isinstance(node[last], dict):
-            known = [entry.name for entry in fields(Partition) if entry.name not in ("grid", "coarse")]
-            known += [f"coarse.{entry.name}" for entry in fields(CoarseModel)]
-            raise RecipeError(f"--set partition.FIELD=VALUE takes the fields {', '.join(known)}; got {change!r}")
+            names = [entry.name for entry in fields(Partition) if entry.name not in ("grid", "coarse")]
+            names += [f"coarse.{entry.name}" for entry in fields(CoarseModel)]
+            raise RecipeError(f"--set partition.FIELD=VALUE takes the fields {', '.join(names)}; got {change!r}")
         try:
             node[last] = json.loads(text)
         except json.JSONDecodeError:
@@ -141,8 +141,8 @@ def to_json(partition: Partition) -> dict[str, Any]:
 
 def from_json(data: Any) -> Partition:
     """Return the partition that :func:`to_json` wrote, checked."""
-    found: Partition = decode(data, Partition, "partition")
-    return check_partition(found)
+    partition: Partition = decode(data, Partition, "partition")
+    return check_partition(partition)
 
 
 def grid_for(blocks: int, spread: Sequence[float], flat: float) -> tuple[int, ...]:

@@ -42,7 +42,7 @@ def shown(metric: str, value: float | None) -> str:
     return f"{value:.{digits}f}"
 
 
-# -- what is shown of a data set ---------------------------------------------------------------------------------------
+# -- the part of one data set ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Figure:
     """A figure as text: mean ("" in quoted rows), spread over seeds, figure of the paper; "" if missing."""
@@ -105,7 +105,7 @@ def parts_of(table: PaperTable, results: Results) -> list[TablePart]:
 def _part(table: PaperTable, results: Results, data_set: str) -> TablePart:
     columns, trained = list(table.columns.get(data_set, ())), data_set in results.data_sets
     means = {row.name: results.mean(row, data_set) for row in results.rows}
-    if trained:  # what else was measured
+    if trained:  # other measured figures
         have = {name for mean in means.values() for name, value in mean.items() if value is not None}
         more = ("fscore", "psnr", "ssim", "lpips", "chamfer")
         columns += [*(name for name in more if name in have and name not in columns), *COSTS]
@@ -129,10 +129,10 @@ def _part(table: PaperTable, results: Results, data_set: str) -> TablePart:
 
 def _best(metric: str, means: Sequence[float | None]) -> str:
     """Return the best figure as text, so that rows with equal text are all marked; "" without figures."""
-    known = [value for value in means if value is not None]
-    if metric in COSTS or len(known) < 2:
+    values = [value for value in means if value is not None]
+    if metric in COSTS or len(values) < 2:
         return ""
-    return shown(metric, (min if metric in LOWER_IS_BETTER else max)(known))
+    return shown(metric, (min if metric in LOWER_IS_BETTER else max)(values))
 
 
 def about_row(row: Row) -> str:
@@ -208,7 +208,7 @@ def write_page(
         table=table,
         parts=parts_of(table, results),
         checked=checked,
-        known=[claim for claim in checked if claim.holds != "unknown"],
+        checkable=[claim for claim in checked if claim.holds != "unknown"],
         deviations=deviations,
         scenes=side_by_side(results),
         run_heads=RUN_HEADS,
@@ -234,32 +234,32 @@ def _run(row: Row, cell: Cell) -> list[str | Markup]:
 
 def side_by_side(results: Results) -> list[dict[str, Any]]:
     """Return one view of each scene in every trained row: its name and its images by kind."""
-    found: list[dict[str, Any]] = []
+    scenes: list[dict[str, Any]] = []
     for scene, runs in _runs_by_scene(results).items():
         if not runs:
-            found.append({"name": scene, "view": None, "runs": []})
+            scenes.append({"name": scene, "view": None, "runs": []})
             continue
         gallery = read_gallery(next(iter(runs.values())) / RENDERS)
         for view in gallery.views[:1] if gallery is not None else ():
-            found.append({"name": scene, "view": view, "runs": list(runs)})
+            scenes.append({"name": scene, "view": view, "runs": list(runs)})
             photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view.file}.png"
-            found[-1]["images"] = images = {}
+            scenes[-1]["images"] = images = {}
             for what, title in IMAGES.items():
                 first = _image(photo, f"{scene}: photograph") if what == "color" else Markup("<div></div>")
                 others = [(name, _last_image(run, view.file, what)) for name, run in runs.items()]
                 images[title] = [first, *(_image(p, f"{scene}, {name}: {title.lower()}") for name, p in others)]
-    return found
+    return scenes
 
 
 def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
     """Return the run with images, of the first seed, by scene and row."""
-    found: dict[str, dict[str, Path]] = {}
+    by_scene: dict[str, dict[str, Path]] = {}
     for row in results.rows:
         for cell in sorted(row.cells, key=lambda cell: cell.seed):
-            runs = found.setdefault(cell.scene, {})
+            runs = by_scene.setdefault(cell.scene, {})
             if (cell.run / RENDERS / "index.json").exists():
                 runs.setdefault(row.name, cell.run)
-    return found
+    return by_scene
 
 
 def _last_image(run: Path, file: str, what: str) -> Path:
@@ -270,5 +270,5 @@ def _last_image(run: Path, file: str, what: str) -> Path:
 
 
 def _image(path: Path, alt: str) -> Markup:
-    found = image_tag(read_image(path), alt=alt, width=IMAGE_WIDTH) if path.exists() else '<div class="soft">none</div>'
-    return Markup(found)
+    tag = image_tag(read_image(path), alt=alt, width=IMAGE_WIDTH) if path.exists() else '<div class="soft">none</div>'
+    return Markup(tag)

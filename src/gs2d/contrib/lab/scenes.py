@@ -16,7 +16,7 @@ from gs2d.contrib.lab.dataset_folders import (
     recognise,
     subfolders,
 )
-from gs2d.contrib.lab.datasets import DATASETS, DataSet, SceneFacts
+from gs2d.contrib.lab.datasets import DATASETS, DataSet, SceneInfo
 from gs2d.contrib.lab.paper_tables import DTU, NERF_SYNTHETIC, TNT
 from gs2d.data import detect_format
 from gs2d.errors import DataError
@@ -26,8 +26,8 @@ OFFICIAL = ("dtu", "tnt")  # evaluators that need several files
 
 
 @dataclass(frozen=True)
-class FoundScene:
-    """A capture."""
+class SweepScene:
+    """A capture of a sweep, with its protocol and ground truth."""
 
     name: str  # of the folder
     path: Path
@@ -43,7 +43,7 @@ class FoundScene:
 
 def find_scenes(
     data: Path, names: Sequence[str] = (), *, protocol: str = "auto", truths: Path | None = None
-) -> tuple[FoundScene, ...]:
+) -> tuple[SweepScene, ...]:
     """Return the captures at or under a folder (up to ``DEPTH`` levels down), sorted by name.
 
     Only ``names``, if there are any; "lego" also finds a folder "nerf_synthetic_lego". ``protocol`` is a name, or
@@ -63,7 +63,7 @@ def find_scenes(
     if not captures:
         why = f"; {'; '.join(broken.values())}" if broken else ""
         raise DataError(
-            f"{data} must be a capture or hold captures (Blender, nerfstudio, DTU, COLMAP), found none{why}"
+            f"{data} must be a capture or contain captures (Blender, nerfstudio, DTU, COLMAP), got none{why}"
         )
     if names:
         chosen = dict.fromkeys(_match(want, captures, data, broken) for want in names)
@@ -75,13 +75,13 @@ def _captures(folder: Path, depth: int) -> dict[str, Path]:
     """Return the captures at or below a folder by name, without searching inside captures."""
     if _is_capture(folder):
         return {folder.resolve().name: folder}
-    found: dict[str, Path] = {}
+    captures: dict[str, Path] = {}
     for inner in subfolders(folder) if depth else ():
         for name, path in _captures(inner, depth - 1).items():
-            if name in found:
-                raise DataError(f"{found[name]} and {path} have the same name; give --data one of them")
-            found[name] = path
-    return found
+            if name in captures:
+                raise DataError(f"{captures[name]} and {path} have the same name; give --data one of them")
+            captures[name] = path
+    return captures
 
 
 def unreadable(folder: Path, depth: int = DEPTH) -> dict[str, str]:
@@ -89,10 +89,10 @@ def unreadable(folder: Path, depth: int = DEPTH) -> dict[str, str]:
     if _is_capture(folder):
         return {}
     lines = missing_lines(folder)
-    found = {folder.resolve().name: lines[0]} if lines else {}
+    first_missing = {folder.resolve().name: lines[0]} if lines else {}
     for inner in subfolders(folder) if depth else ():
-        found |= unreadable(inner, depth - 1)
-    return found
+        first_missing |= unreadable(inner, depth - 1)
+    return first_missing
 
 
 def _is_capture(folder: Path) -> bool:
@@ -118,35 +118,35 @@ def _named(want: str, names: Sequence[str]) -> list[str]:
     return close or [name for name in names if name.lower().endswith(f"_{want.lower()}")]
 
 
-def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None) -> FoundScene:
+def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None) -> SweepScene:
     kind = detect_format(path)
     protocol = named or protocol_of(path, kind, truths)
-    known = recognise(path, truths)
-    if known is not None and protocol.name not in {scene.protocol for scene in known[0].scenes}:
-        known = None  # the name of a scene by coincidence, or another protocol was requested
-    if known is None:
+    match = recognise(path, truths)
+    if match is not None and protocol.name not in {scene.protocol for scene in match[0].scenes}:
+        match = None  # the name of a scene by coincidence, or another protocol was requested
+    if match is None:
         data_set = f"other ({protocol.name})"
         truth = _plain_truth(name, path, truths)
-        return FoundScene(name, path, kind, protocol, protocol.downscale, data_set, name, truth, truth is not None, ())
-    dataset, facts = known
-    truth, scored = _truth_of(dataset, facts, name, path, truths)
+        return SweepScene(name, path, kind, protocol, protocol.downscale, data_set, name, truth, truth is not None, ())
+    dataset, info = match
+    truth, scored = _truth_of(dataset, info, name, path, truths)
     missing = missing_lines(path)
     if not scored:
-        missing += tuple(piece.line() for piece in find_truth(dataset, facts, path, truths)[1])
-    place = (PAPER_NAMES[dataset.name], facts.name)
-    downscale = facts.downscale if named is None else protocol.downscale
-    return FoundScene(name, path, kind, protocol, downscale, *place, truth, scored, missing)
+        missing += tuple(piece.line() for piece in find_truth(dataset, info, path, truths)[1])
+    place = (PAPER_NAMES[dataset.name], info.name)
+    downscale = info.downscale if named is None else protocol.downscale
+    return SweepScene(name, path, kind, protocol, downscale, *place, truth, scored, missing)
 
 
 def _truth_of(
-    dataset: DataSet, facts: SceneFacts, name: str, path: Path, truths: Path | None
+    dataset: DataSet, info: SceneInfo, name: str, path: Path, truths: Path | None
 ) -> tuple[Path | None, bool]:
     """Return the ground truth for the evaluation of a scene, and whether there is any."""
     if dataset.evaluator in OFFICIAL:
-        files, lacking = find_truth(dataset, facts, path, truths)
-        if files and not lacking:
+        files, missing = find_truth(dataset, info, path, truths)
+        if files and not missing:
             return truths, True
-    own = _plain_truth(name, path, truths) or _plain_truth(facts.name, path, truths)
+    own = _plain_truth(name, path, truths) or _plain_truth(info.name, path, truths)
     return own, own is not None
 
 
@@ -159,13 +159,13 @@ def _plain_truth(name: str, capture: Path, folder: Path | None) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
-def missing_scenes(scenes: Sequence[FoundScene]) -> dict[str, tuple[list[str], int]]:
+def missing_scenes(scenes: Sequence[SweepScene]) -> dict[str, tuple[list[str], int]]:
     """Return the missing scenes and the number of scenes of each data set of which some are present."""
-    found: dict[str, tuple[list[str], int]] = {}
+    missing: dict[str, tuple[list[str], int]] = {}
     for key, data_set in PAPER_NAMES.items():
         have = {scene.scene for scene in scenes if scene.data_set == data_set}
-        known = [facts.name for facts in DATASETS[key].scenes]
-        absent = [name for name in known if name not in have]
+        names = [scene.name for scene in DATASETS[key].scenes]
+        absent = [name for name in names if name not in have]
         if have and absent:
-            found[data_set] = (absent, len(known))
-    return found
+            missing[data_set] = (absent, len(names))
+    return missing

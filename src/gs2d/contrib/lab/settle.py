@@ -1,4 +1,4 @@
-"""What all blocks share, resolved before training: recipe, protocol, capture and grid."""
+"""Resolve the settings that all blocks share, before training: recipe, protocol, capture and grid."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def definition_of(settled: LoadedRun, options: TrainOptions, partition: Partitio
 
 
 def settle(options: TrainOptions, on_event: OnEvent, recipe: Recipe | None = None) -> LoadedRun:
-    """Read the headers of a capture and resolve what all blocks share, with the near plane of the whole scene.
+    """Read the headers of a capture and resolve the settings of all blocks, with the near plane of the whole scene.
 
     With a resolved ``recipe``, the protocol of the options is resolved, too. Nothing is written.
     """
@@ -98,23 +98,23 @@ def fitting_partition(
     settled: LoadedRun, options: TrainOptions, partition: Partition, on_event: OnEvent
 ) -> Partition | None:
     """Return the partition with as many blocks as memory needs; None if one training fits into memory."""
-    found: Estimate | None = None
+    estimated: Estimate | None = None
     recipe = settled.recipe
     try:
-        found = estimate(settled.scene, recipe, settled.backend, downscale=settled.resolved.downscale)
+        estimated = estimate(settled.scene, recipe, settled.backend, downscale=settled.resolved.downscale)
     except DataError as error:
         on_event(Notice(f"one training does not fit: {error}"))
-    if found is not None and found.max_splats is None:
+    if estimated is not None and estimated.max_splats is None:
         on_event(Notice("one training fits into memory: no blocks (--blocks 3x3 makes some)"))
         return None
-    room = partition.splats if found is None or found.max_splats is None else found.max_splats
+    room = partition.splats if estimated is None or estimated.max_splats is None else estimated.max_splats
     coarse = replace(partition.coarse, max_splats=max(2, min(partition.coarse.max_splats, room // COARSE_PART)))
     trained = max(2, min(partition.splats, room - coarse.max_splats))
     photographs = math.ceil(len(settled.scene.train) / partition.photographs)
     count = max(2, photographs)
-    if found is not None:
-        wanted = expected_splats(recipe, found.start).expected * (1 + 2 * partition.margin) ** 2
-        count = max(count, math.ceil(wanted / trained))
+    if estimated is not None:
+        expected = expected_splats(recipe, estimated.start).expected * (1 + 2 * partition.margin) ** 2
+        count = max(count, math.ceil(expected / trained))
     points = settled.scene.points
     centers = np.array([view.camera.center for view in settled.scene.train])
     spread = spread_of(centers, None if points is None else points.points)
@@ -133,7 +133,7 @@ def fitting_partition(
 def with_budget(recipe: Recipe, splats: int) -> Recipe:
     """Return the recipe with a limit on splats, for densifiers that have one."""
 
-    def kept(densify: GradDensify | Densify | None) -> GradDensify | Densify | None:
+    def limited(densify: GradDensify | Densify | None) -> GradDensify | Densify | None:
         if isinstance(densify, GradDensify):
             return replace(densify, max_splats=min(splats, densify.max_splats or splats))
         if densify is not None and "max_splats" in densify.options:
@@ -141,7 +141,7 @@ def with_budget(recipe: Recipe, splats: int) -> Recipe:
             return replace(densify, options={**densify.options, "max_splats": most})
         return densify
 
-    return replace(recipe, stages=tuple(replace(stage, densify=kept(stage.densify)) for stage in recipe.stages))
+    return replace(recipe, stages=tuple(replace(stage, densify=limited(stage.densify)) for stage in recipe.stages))
 
 
 def budget_of(recipe: Recipe) -> int | None:
@@ -174,7 +174,7 @@ def block_recipe(recipe: Recipe, partition: Partition, block: BlockOfSplit) -> R
     stages = tuple(replace(stage, sh_interval=0) for stage in recipe.stages)
     dense = recipe.dense_start if partition.start == "dense" else None
     dense = None if dense is None else replace(dense, required=False)  # else the coarse model is the start
-    value = replace(_with_given_exposure(recipe), stages=stages, dense_start=dense)
+    value = replace(_with_fixed_exposure(recipe), stages=stages, dense_start=dense)
     return validate(with_budget(value, max(2, most)))
 
 
@@ -197,10 +197,10 @@ def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Rec
         on_enter=(),
         sh_interval=0,
     )
-    return validate(replace(_with_given_exposure(recipe), stages=(stage,), dense_start=None, removal=None))
+    return validate(replace(_with_fixed_exposure(recipe), stages=(stage,), dense_start=None, removal=None))
 
 
-def _with_given_exposure(recipe: Recipe) -> Recipe:
+def _with_fixed_exposure(recipe: Recipe) -> Recipe:
     """Return the recipe with fixed exposures, if it learns exposures."""
     exposure = recipe.quantities.get("exposure")
     return recipe if exposure is None else recipe.with_learned(exposure.with_options(initial="given"))

@@ -97,29 +97,29 @@ def split_model(
     spread = spread_of(np.array([view.camera.center for view in scene.train]), _points(scene))
     cells = cut(places, total, spread.axes[: len(partition.grid)], partition.grid, partition.margin)
     near = np.stack([cells.near(cell, places) for cell in range(len(cells))])  # [B, N]
-    shares, seen = _shares(looks, near, partition, on_event)
+    shares, visible = _shares(looks, near, partition, on_event)
     blocks = []
     owner = cells.owners(places)
     for cell, name in enumerate(cells.names):
         chosen, floor = choose_views(shares[:, cell], partition)
         for index in floor:
-            seen[cell] |= looks.at(index) > LEAST_WEIGHT
+            visible[cell] |= looks.at(index) > LEAST_WEIGHT
         core = int((owner == cell).sum())
         views = tuple(scene.train[i].name for i in chosen)
-        own, frozen = near[cell] & seen[cell], ~near[cell] & seen[cell]
+        own, frozen = near[cell] & visible[cell], ~near[cell] & visible[cell]
         why = "none of its splats is visible" if not own.any() else "no photograph shows it" if not views else ""
         if why:
             on_event(Notice(f"block {name} is not trained: {why}; its {core} splats are those of the coarse model"))
         rows = FROZEN * frozen.astype(np.uint8) + OWN * own.astype(np.uint8)
-        known = _exposures(scene, views)
-        write_start(start_file(folder, name), rows, known)
+        exposures = _exposures(scene, views)
+        write_start(start_file(folder, name), rows, exposures)
         extent = camera_extent([scene.train[i].camera for i in chosen]) if len(chosen) > 1 else scene.extent
         counts = {"floor": len(floor), "own": int(own.sum()), "frozen": int(frozen.sum()), "core": core}
         weight = float(total[near[cell]].sum() / total.sum())
         blocks.append(BlockOfSplit(name, () if why else views, weight=weight, extent=extent, skipped=why, **counts))
-    found = Split(cells, tuple(blocks))
-    write_json(folder / CELLS, found.to_json())
-    return found
+    split = Split(cells, tuple(blocks))
+    write_json(folder / CELLS, split.to_json())
+    return split
 
 
 def split_seams(
@@ -136,23 +136,23 @@ def split_seams(
     splats, scene = trained.splats, trained.scene
     places, width = splats.means.detach().cpu().numpy(), partition.seam * split.cells.side
     strip = split.cells.distance_to_seam(places) < width
-    looks, shares, seen = Looks(trained), [], np.zeros(len(splats), dtype=bool)
+    looks, shares, visible = Looks(trained), [], np.zeros(len(splats), dtype=bool)
     for weights in counted(looks.all(), "measuring seams", len(looks), on_event):
         shares.append(weights[strip].sum() / max(weights.sum(), LEAST_WEIGHT))
         if shares[-1] >= partition.min_share / 2:
-            seen |= weights > LEAST_WEIGHT
+            visible |= weights > LEAST_WEIGHT
     chosen = [view.name for view, share in zip(scene.train, shares, strict=True) if share >= partition.min_share / 2]
-    own = strip & seen
+    own = strip & visible
     rows = np.where(own, OWN, FROZEN).astype(np.uint8)
-    known = _exposures(scene, chosen)
-    write_start(start_file(folder, SEAMS), rows, known)
+    exposures = _exposures(scene, chosen)
+    write_start(start_file(folder, SEAMS), rows, exposures)
     return tuple(chosen) if own.any() else ()
 
 
 def _exposures(scene: Scene, names: Sequence[str]) -> np.ndarray | None:
     """Return the exposure transforms [V, 3, 4] of training views; None if none were learned."""
-    known = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
-    return np.stack([known[name] for name in names]) if known and names else None
+    exposures = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
+    return np.stack([exposures[name] for name in names]) if exposures and names else None
 
 
 class Looks:
@@ -164,8 +164,8 @@ class Looks:
     def at(self, index: int) -> np.ndarray:
         """Return the weights in a view."""
         trained, camera = self._trained, shrunk(self._views[index].camera, SIDE)
-        found = shown_weights(trained.splats, camera, trained.settings, trained.backend)
-        return np.asarray(found.cpu().numpy().astype(np.float64))
+        weights = shown_weights(trained.splats, camera, trained.settings, trained.backend)
+        return np.asarray(weights.cpu().numpy().astype(np.float64))
 
     def __len__(self) -> int:
         return len(self._views)
@@ -180,15 +180,15 @@ def _shares(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return shares of views [V, B], and for each block which splats [N] its photographs show."""
     shares = np.zeros((len(looks), len(near)))
-    seen = [np.zeros(near.shape[1], dtype=bool) for _ in near]
+    visible = [np.zeros(near.shape[1], dtype=bool) for _ in near]
     for index, weights in enumerate(counted(looks.all(), "choosing photographs", len(looks), on_event)):
         whole = weights.sum()
         if whole <= 0:
             continue
         shares[index] = [weights[inside].sum() / whole for inside in near]
         for cell in np.flatnonzero(shares[index] >= partition.min_share):
-            seen[cell] |= weights > LEAST_WEIGHT
-    return shares, seen
+            visible[cell] |= weights > LEAST_WEIGHT
+    return shares, visible
 
 
 def choose_views(shares: np.ndarray, partition: Partition) -> tuple[np.ndarray, list[int]]:
@@ -215,12 +215,12 @@ def merge(coarse: Splats, split: Split, trained: dict[str, Splats], rows: dict[s
     owner = split.cells.owners(coarse.means.detach().cpu().numpy())
     parts = []
     for cell, block in enumerate(split.blocks):
-        left = owner == cell
+        remaining = owner == cell
         if block.name in trained:
             splats = trained[block.name]
             inside = split.cells.owners(splats.means.detach().cpu().numpy()) == cell
             parts.append(splats.rows(torch.from_numpy(inside)))
-            left = left & (rows[block.name] != OWN)
-        parts.append(coarse.rows(torch.from_numpy(left)))
+            remaining = remaining & (rows[block.name] != OWN)
+        parts.append(coarse.rows(torch.from_numpy(remaining)))
     names = [name for name, _ in coarse.items()]
     return Splats(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -1,10 +1,10 @@
-"""Score a reconstructed mesh against the ground truth, over the surface that the cameras can see.
+"""Score a reconstructed mesh against the ground truth, over the surface visible to the cameras.
 
 The protocol of this project (docs/notebook/evaluation.md):
 
 1. Points are sampled on both surfaces, area-weighted and from a seed.
-2. Completeness and recall use the distances from true points to the reconstruction. Only true surface seen by at least
-   ``min_views`` cameras counts, by view counts per face that come with the data, or by depth buffers.
+2. Completeness and recall use the distances from true points to the reconstruction. Only true surface visible to at
+   least ``min_views`` cameras counts, by view counts per face that come with the data, or by depth buffers.
 3. Accuracy and precision use the distances from reconstructed points to the whole true surface. Only reconstructed
    surface that a camera would see counts: interior surface, which no image shows, does not change the score.
 4. Distances are to triangles, or to the nearest point of a point cloud.
@@ -256,7 +256,7 @@ def evaluate_surface(
     truth: Mesh | np.ndarray,
     *,
     cameras: Sequence[Camera] = (),
-    seen: np.ndarray | None = None,
+    view_counts: np.ndarray | None = None,
     min_views: int = VISIBLE_SURFACE.min_views,
     T_truth_mesh: np.ndarray | None = None,
     thresholds: Sequence[float] | None = None,
@@ -264,14 +264,14 @@ def evaluate_surface(
 ) -> SurfaceScore:
     """Score a mesh in the frame of the cameras against a true surface or points [P, 3] in their own frame.
 
-    The cameras determine the visible surface; without them all surface is scored, unless ``seen`` [F] has the number of
-    views that see each true face. True surface seen by fewer than ``min_views`` is not scored. ``T_truth_mesh`` [4, 4]
-    is a similarity transform from the frame of the mesh to that of the truth. ``thresholds`` are in units of the truth;
-    default 0.25 %, 0.5 % and 1 % of the diagonal of its bounding box. ``samples`` is the number of points on each
-    surface.
+    The cameras determine the visible surface; without them all surface is scored, unless ``view_counts`` [F] has the
+    number of views that see each true face. True surface visible in fewer than ``min_views`` is not scored.
+    ``T_truth_mesh`` [4, 4] is a similarity transform from the frame of the mesh to that of the truth. ``thresholds``
+    are in units of the truth; default 0.25 %, 0.5 % and 1 % of the diagonal of its bounding box. ``samples`` is the
+    number of points on each surface.
 
-    Raises DataError if the truth is empty, no part of it is visible, or the length of ``seen`` differs from its number
-    of faces.
+    Raises DataError if the truth is empty, no part of it is visible, or the length of ``view_counts`` differs from its
+    number of faces.
     """
     T = np.eye(4) if T_truth_mesh is None else np.asarray(T_truth_mesh, dtype=np.float64)
     scale = similarity_scale(T, "T_truth_mesh")
@@ -285,7 +285,7 @@ def evaluate_surface(
     local = _moved(truth, np.linalg.inv(T))
     tolerance = VISIBLE_SURFACE.seen_tolerance * diagonal / scale
     counts = partial(visible_counts, cameras=cameras, tolerance=tolerance)
-    theirs = _true_side(local, cameras, seen, min_views, samples, counts)
+    theirs = _true_side(local, cameras, view_counts, min_views, samples, counts)
     ours = _reconstructed_side(mesh, cameras, samples, counts)
     if not len(mesh.faces) or not len(ours.points):
         why = "the mesh is empty" if not len(mesh.faces) else "no camera sees any of the mesh"
@@ -323,22 +323,22 @@ def _threshold_score(accuracy: np.ndarray, completeness: np.ndarray, threshold: 
 def _true_side(
     truth: Mesh | np.ndarray,
     cameras: Sequence[Camera],
-    seen: np.ndarray | None,
+    view_counts: np.ndarray | None,
     min_views: int,
     samples: int,
     counts: _Counts,
 ) -> _Side:
     """Return true points that enough cameras see."""
     if not isinstance(truth, Mesh):
-        if seen is not None:
+        if view_counts is not None:
             raise DataError("view counts per face need a true mesh, got a point cloud")
         keep = frustum_counts(truth, cameras) >= min_views if len(cameras) else np.ones(len(truth), bool)
         return _side(truth, keep, samples)
     spread = sample_surface(truth, samples)
-    if seen is not None:
-        if len(seen) != len(truth.faces):
-            raise DataError(f"expected one count for each of {len(truth.faces)} true faces, got {len(seen)}")
-        return _side(spread.points, np.asarray(seen)[spread.faces] >= min_views, samples)
+    if view_counts is not None:
+        if len(view_counts) != len(truth.faces):
+            raise DataError(f"expected one count for each of {len(truth.faces)} true faces, got {len(view_counts)}")
+        return _side(spread.points, np.asarray(view_counts)[spread.faces] >= min_views, samples)
     if not len(cameras):
         return _side(spread.points, np.ones(len(spread.points), bool), samples)
     return _side(spread.points, counts(spread.points, truth) >= min_views, samples)
@@ -347,10 +347,10 @@ def _true_side(
 def _side(points: np.ndarray, keep: np.ndarray, samples: int) -> _Side:
     if not keep.any():
         raise DataError("no camera sees any part of the ground truth; check its coordinate system")
-    kept = points[keep]
-    if len(kept) > samples:  # a large point cloud
-        kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), samples, replace=False))]
-    return _Side(kept, float(1.0 - keep.mean()))
+    scored = points[keep]
+    if len(scored) > samples:  # a large point cloud
+        scored = scored[np.sort(np.random.default_rng(0).choice(len(scored), samples, replace=False))]
+    return _Side(scored, float(1.0 - keep.mean()))
 
 
 def _reconstructed_side(mesh: Mesh, cameras: Sequence[Camera], samples: int, counts: _Counts) -> _Side:

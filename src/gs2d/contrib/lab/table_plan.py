@@ -16,7 +16,7 @@ from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
 from gs2d.contrib.lab.lab_options import SWEEP, SweepOptions
 from gs2d.contrib.lab.paper_tables import PAPER_TABLES, PaperTable, recipe_table
-from gs2d.contrib.lab.scenes import FoundScene, find_scenes
+from gs2d.contrib.lab.scenes import SweepScene, find_scenes
 from gs2d.contrib.lab.training_task import TrainingTask, stage_keys
 from gs2d.errors import RecipeError
 from gs2d.io.run_dir import versions
@@ -29,7 +29,7 @@ class Plan:
 
     options: SweepOptions
     table: PaperTable
-    scenes: tuple[FoundScene, ...]
+    scenes: tuple[SweepScene, ...]
     cells: Mapping[tuple[str, str, int], TrainingTask]
 
     @property
@@ -90,7 +90,7 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
             raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
 
 
-def make_task(options: SweepOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> TrainingTask:
+def make_task(options: SweepOptions, scene: SweepScene, name: str, recipe: Recipe, seed: int) -> TrainingTask:
     """Return the task that trains a recipe (``trained_recipe`` of ``name``) on a scene."""
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
@@ -113,30 +113,30 @@ def make_task(options: SweepOptions, scene: FoundScene, name: str, recipe: Recip
     evaluate = None
     if scene.scored or options.lpips_weights is not None:
         evaluate = EvaluateOptions(ground_truth=scene.truth, lpips_weights=options.lpips_weights)
-    facts = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
+    settings = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
     return TrainingTask(
         name=train.out.name,
         record=options.out / "jobs" / f"{train.out.name}.json",
         train=train,
         evaluate=evaluate,
-        stage_keys=stage_keys((*map(repr, facts), recipe.init_points, recipe.sh_degree), to_json(recipe)["stages"]),
-        wanted=tuple(_wanted(scene, options)),
+        stage_keys=stage_keys((*map(repr, settings), recipe.init_points, recipe.sh_degree), to_json(recipe)["stages"]),
+        scores=tuple(_scores(scene, options)),
     )
 
 
-def _wanted(scene: FoundScene, options: SweepOptions) -> Iterator[str]:
-    """Yield the inputs of scores; a run that lacks one is scored again."""
+def _scores(scene: SweepScene, options: SweepOptions) -> Iterator[str]:
+    """Yield the scores with their inputs; a run without one of them is scored again."""
     if scene.scored:
         yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
     if options.lpips_weights is not None:
         yield f"lpips: {options.lpips_weights.resolve()}"
 
 
-# -- the commands that do it -------------------------------------------------------------------------------------------
+# -- command lines -----------------------------------------------------------------------------------------------------
 def paper_command(options: SweepOptions) -> str:
     """Return the command line of a table."""
-    said = ("recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json")
-    return _command(["sweep", *options.recipes], options, said)
+    omitted = ("recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json")
+    return _command(["sweep", *options.recipes], options, omitted)
 
 
 def commands_of(task: TrainingTask) -> list[str]:
@@ -148,13 +148,13 @@ def commands_of(task: TrainingTask) -> list[str]:
     return lines
 
 
-def _command(words: Sequence[str], options: Any, said: Sequence[str]) -> str:
-    """Return a command line: its first words, and each option with another value than the default, without ``said``."""
+def _command(words: Sequence[str], options: Any, omitted: Sequence[str]) -> str:
+    """Return a command line: its first words, and each option that differs from the default and is not ``omitted``."""
     line = ["gs2d", *words]
     hints = get_type_hints(type(options), include_extras=True)
     for field in fields(options):
         value = getattr(options, field.name)
-        if field.name in said or value == field.default:
+        if field.name in omitted or value == field.default:
             continue
         if any(isinstance(mark, Arg) and mark.setting for mark in getattr(hints[field.name], "__metadata__", ())):
             parts = value if isinstance(value, tuple) else (value,)

@@ -62,12 +62,12 @@ def several_at_once(
 
 
 def given_up(task: Task, failed: Collection[str], on_event: OnEvent) -> bool:
-    """Mark a task as failed if a task that it needs has failed; return whether it is."""
-    lacking = next((name for name in task.after if name in failed), None)
-    if lacking is None:
+    """Mark a task as failed if a task that it needs has failed; return whether one has."""
+    needed = next((name for name in task.after if name in failed), None)
+    if needed is None:
         return False
-    task.write("failed", reason=f"not started: {lacking} failed", **task.facts())
-    on_event(Notice(f"{task.name} is not started: {lacking} failed"))
+    task.write("failed", reason=f"not started: {needed} failed", **task.details())
+    on_event(Notice(f"{task.name} is not started: {needed} failed"))
     return True
 
 
@@ -76,6 +76,6 @@ def startable(waiting: Sequence[AnyTask], busy: Sequence[AnyTask]) -> AnyTask | 
     if any(task.alone for task in busy):
         return None
     ahead = {task.name for task in (*waiting, *busy)}  # tasks behind a failed one were removed
-    taken = {key for task in busy for key in task.keys_ahead()}
-    ready = (task for task in waiting if not ahead & set(task.after) and not taken & task.keys())
+    locked = {key for task in busy for key in task.keys_ahead()}
+    ready = (task for task in waiting if not ahead & set(task.after) and not locked & task.keys())
     return next((task for task in ready if not (task.alone and busy)), None)

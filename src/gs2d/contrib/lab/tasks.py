@@ -1,4 +1,4 @@
-"""Tasks: values that other processes and machines can run, with a record of their outcome.
+"""Tasks: values that other processes and machines can run, with a record of their status.
 
 The record is ``jobs/NAME.json`` in the output folder; finished tasks are not run again. The module imports torch only
 in functions, because a process selects its GPU before torch loads.
@@ -20,7 +20,7 @@ from gs2d.io.run_dir import now
 from gs2d.io.run_schema import check_shape
 from gs2d.training.events import Notice, OnEvent, ignore
 
-_OUTCOME = {"state": str, "reason?": str, "notes?": (dict, None), "wanted?": [str], "trained?": bool}
+_RECORD = {"state": str, "reason?": str, "notes?": (dict, None), "wanted?": [str], "trained?": bool}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class Task(ABC):
     """A piece of work, as a frozen dataclass of plain values and paths that can be pickled."""
 
     name: str  # unique, valid as a file name
-    record: Path  # file of the outcome
+    record: Path  # file of the status
     after: tuple[str, ...] = ()  # names of tasks that must finish first
     inputs: tuple[Path, ...] = ()  # files in the output folder that the task reads
     outputs: tuple[Path, ...] = ()  # files there that it writes; a task is finished only while they exist
@@ -37,23 +37,23 @@ class Task(ABC):
     memory: float | None = None  # limit, GiB
     gpu: bool = True  # whether the task uses a GPU, if the backend does
 
-    def outcome(self) -> dict[str, Any]:
+    def status(self) -> dict[str, Any]:
         """Return the record: ``state`` (new, running, done or failed), ``reason``, and results of the task."""
         if not self.record.exists():
             return {"state": "new"}
-        found: dict[str, Any] = read_json(self.record)
-        check_shape(self.record, found, _OUTCOME, f"delete it to run {self.name} again")
-        return found
+        record: dict[str, Any] = read_json(self.record)
+        check_shape(self.record, record, _RECORD, f"delete it to run {self.name} again")
+        return record
 
     def is_done(self) -> bool:
         """Return whether the task is finished."""
-        return self.outcome()["state"] == "done" and all(path.exists() for path in self.outputs)
+        return self.status()["state"] == "done" and all(path.exists() for path in self.outputs)
 
-    def write(self, state: str, **facts: Any) -> None:
+    def write(self, state: str, **entries: Any) -> None:
         """Write the record."""
-        write_json(self.record, {"state": state, **facts, "time": time.time(), "at": now()})
+        write_json(self.record, {"state": state, **entries, "time": time.time(), "at": now()})
 
-    def facts(self) -> dict[str, Any]:
+    def details(self) -> dict[str, Any]:
         """Return entries of the record that do not depend on success."""
         return {}
 
@@ -79,11 +79,11 @@ AnyTask = TypeVar("AnyTask", bound=Task)
 
 def failures(tasks: Sequence[Task]) -> dict[str, str]:
     """Return the reasons of failed tasks by name."""
-    outcomes = {task.name: task.outcome() for task in tasks}
+    statuses = {task.name: task.status() for task in tasks}
     return {
-        name: outcome.get("reason", "no reason was recorded")
-        for name, outcome in outcomes.items()
-        if outcome["state"] == "failed"
+        name: status.get("reason", "no reason was recorded")
+        for name, status in statuses.items()
+        if status["state"] == "failed"
     }
 
 
@@ -97,7 +97,7 @@ def do(task: Task, on_event: OnEvent = ignore) -> None:
         text = " ".join(str(error).split())
         reason = f"{type(error).__name__}: {error}" if is_fault else text or type(error).__name__
         more = {"traceback": traceback.format_exc()} if is_fault else {}
-        task.write("failed", reason=reason, **task.facts(), **more)
+        task.write("failed", reason=reason, **task.details(), **more)
         on_event(Notice(f"{task.name} failed: {reason}"))
         return
-    task.write("done", **result, **task.facts())
+    task.write("done", **result, **task.details())

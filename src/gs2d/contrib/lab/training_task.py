@@ -24,8 +24,8 @@ class TrainingTask(Task):
     train: TrainOptions  # with ``resume`` and the shared stage cache
     evaluate: EvaluateOptions | None = None  # scores beyond those of training
     stage_keys: tuple[str, ...] = ()  # one per stage; tasks with equal keys train the same stage
-    # names of the scores and their inputs; a finished task is scored again if its record lacks one
-    wanted: tuple[str, ...] = ()
+    # names of the scores and their inputs; a finished task is scored again if one is not in its record
+    scores: tuple[str, ...] = ()
 
     def is_trained(self) -> bool:
         """Return whether its run has splats."""
@@ -33,11 +33,11 @@ class TrainingTask(Task):
 
     def is_done(self) -> bool:
         """Return whether the run is trained, has all scores, and still exists."""
-        outcome = self.outcome()
-        is_scored = set(self.wanted) <= set(outcome.get("wanted", self.wanted))
-        return outcome["state"] == "done" and is_scored and (self.is_trained() or not outcome.get("trained", False))
+        status = self.status()
+        is_scored = set(self.scores) <= set(status.get("wanted", self.scores))
+        return status["state"] == "done" and is_scored and (self.is_trained() or not status.get("trained", False))
 
-    def facts(self) -> dict[str, Any]:
+    def details(self) -> dict[str, Any]:
         """Return whether the run is trained, which includes its image scores."""
         return {"trained": self.is_trained()}
 
@@ -55,15 +55,15 @@ class TrainingTask(Task):
 
     def work(self, on_event: OnEvent) -> dict[str, Any]:
         """Train and score."""
-        return {"notes": train_and_evaluate(self, on_event), "wanted": list(self.wanted)}
+        return {"notes": train_and_evaluate(self, on_event), "wanted": list(self.scores)}
 
 
-def stage_keys(facts: Sequence[Any], stages: Sequence[Any]) -> tuple[str, ...]:
-    """Return a key of each stage: a hash of common facts of the runs and of all stages up to it, as JSON values.
+def stage_keys(settings: Sequence[Any], stages: Sequence[Any]) -> tuple[str, ...]:
+    """Return a key of each stage: a hash of the settings of the run and of all stages up to it, as JSON values.
 
     Keys only decide which task waits. A wrong key costs time, but never changes a result.
     """
-    texts = (repr((list(facts), list(stages[: i + 1]))) for i in range(len(stages)))
+    texts = (repr((list(settings), list(stages[: i + 1]))) for i in range(len(stages)))
     return tuple(hashlib.sha256(text.encode()).hexdigest()[:32] for text in texts)
 
 

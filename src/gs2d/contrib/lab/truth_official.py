@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.contrib.lab.dataset_folders import find_truth, published_log, recognise
-from gs2d.contrib.lab.datasets import SceneFacts
+from gs2d.contrib.lab.datasets import SceneInfo
 from gs2d.contrib.lab.dtu_reader import dtu_silhouettes
 from gs2d.contrib.lab.evaluate_dtu import ViewSilhouette, evaluate_dtu, read_dtu_truth
 from gs2d.contrib.lab.evaluate_tnt import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
@@ -20,7 +20,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.image_files import read_mask
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.evaluation.evaluators import register_evaluator
+from gs2d.evaluation.evaluators import Notify, register_evaluator
 from gs2d.io.run_dir import make_folder
 
 
@@ -28,27 +28,27 @@ from gs2d.io.run_dir import make_folder
 class OfficialTruth:
     """The files of an official ground truth."""
 
-    facts: SceneFacts
+    info: SceneInfo
     files: Mapping[str, Path]  # by kind, as of ``gs2d.contrib.lab.dataset_folders.find_truth``
 
 
-def find_official(name: str, capture: Path, given: Path | None, tell: Callable[[str], None]) -> OfficialTruth | None:
+def find_official(name: str, capture: Path, ground_truth: Path | None, notify: Notify) -> OfficialTruth | None:
     """Return the official ground truth of a capture, if its data set has the evaluator ``name``.
 
-    Raises DataError if the folder ``given`` lacks files of this scene.
+    Raises DataError if files of this scene are missing in the folder ``ground_truth``.
     """
-    known = None if given is not None and not given.is_dir() else recognise(capture, given)
-    if known is None or known[0].evaluator != name:
+    match = None if ground_truth is not None and not ground_truth.is_dir() else recognise(capture, ground_truth)
+    if match is None or match[0].evaluator != name:
         return None
-    dataset, facts = known
-    files, missing = find_truth(dataset, facts, capture, given)
+    dataset, info = match
+    files, missing = find_truth(dataset, info, capture, ground_truth)
     if not missing:
-        return OfficialTruth(facts, files)
-    if given is not None:
+        return OfficialTruth(info, files)
+    if ground_truth is not None:
         lines = "; ".join(piece.line() for piece in missing)
-        raise DataError(f"{given} must hold the ground truth of {facts.name} ({dataset.title}): {lines}")
+        raise DataError(f"{ground_truth} must hold the ground truth of {info.name} ({dataset.title}): {lines}")
     for piece in missing if files else ():
-        tell(piece.line())
+        notify(piece.line())
     return None
 
 
@@ -58,16 +58,16 @@ class DtuEvaluator:
 
     has_thresholds = False
 
-    def find(self, capture: Path, given: Path | None, tell: Callable[[str], None]) -> OfficialTruth | None:
+    def find(self, capture: Path, ground_truth: Path | None, notify: Notify) -> OfficialTruth | None:
         """Return the official files of a scan of DTU."""
-        return find_official("dtu", capture, given, tell)
+        return find_official("dtu", capture, ground_truth, notify)
 
     def score(
         self, mesh: Mesh, truth: OfficialTruth, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
     ) -> dict[str, Any]:
         """Compare by the official evaluation."""
         make_folder(folder)
-        scan = read_dtu_truth(truth.facts.scan or 0, truth.files)
+        scan = read_dtu_truth(truth.info.scan or 0, truth.files)
         score = evaluate_dtu(mesh, _silhouettes(scene), scene.T_metric_scene, scan)
         return {
             "unit": "mm",
@@ -87,15 +87,15 @@ class TanksAndTemplesEvaluator:
 
     has_thresholds = False
 
-    def find(self, capture: Path, given: Path | None, tell: Callable[[str], None]) -> OfficialTruth | None:
+    def find(self, capture: Path, ground_truth: Path | None, notify: Notify) -> OfficialTruth | None:
         """Return the official files of a scene of Tanks and Temples."""
-        return find_official("tnt", capture, given, tell)
+        return find_official("tnt", capture, ground_truth, notify)
 
     def score(
         self, mesh: Mesh, truth: OfficialTruth, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
     ) -> dict[str, Any]:
         """Compare by the official evaluation."""
-        name, tau = truth.facts.name, truth.facts.tau
+        name, tau = truth.info.name, truth.info.tau
         if tau is None:
             raise DataError(f"a tau was expected for {name}, its data set names none")
         make_folder(folder)
@@ -123,9 +123,9 @@ class TanksAndTemplesEvaluator:
 
 def _silhouettes(scene: Scene) -> list[ViewSilhouette]:
     """Return the mask files at full size, else the silhouettes of the views."""
-    found = dtu_silhouettes(scene.root) if scene.root is not None else ()
-    if found:
-        return [ViewSilhouette(view.camera, read_mask(view.path)) for view in found]
+    files = dtu_silhouettes(scene.root) if scene.root is not None else ()
+    if files:
+        return [ViewSilhouette(view.camera, read_mask(view.path)) for view in files]
     own = [(view.camera, view.object_mask()) for view in scene.train]
     return [ViewSilhouette(camera, mask) for camera, mask in own if mask is not None]
 

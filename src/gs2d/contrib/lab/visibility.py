@@ -31,8 +31,8 @@ def visible_counts(points: np.ndarray, mesh: Mesh, cameras: Sequence[Camera], *,
 
     counts = np.zeros(len(points), np.int64)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        for seen in pool.map(visible, cameras):
-            counts += seen
+        for in_view in pool.map(visible, cameras):
+            counts += in_view
     return counts
 
 

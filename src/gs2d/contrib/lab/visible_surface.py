@@ -1,11 +1,10 @@
-"""The evaluator of meshes against a true mesh or points, over the surface that the training views see.
+"""The evaluator of meshes against a true mesh or points, over the surface visible in the training views.
 
 The settings are decisions of this project ([d]): no public protocol exists.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,16 +17,14 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.arrays import read_npy
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.evaluation.evaluators import GENERAL, register_evaluator
+from gs2d.evaluation.evaluators import GENERAL, Notify, register_evaluator
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.run_dir import make_folder
 from gs2d.io.splat_ply import ply_kind
 
-Tell = Callable[[str], None]
-
 APART = 0.05  # of the diagonal of the truth: a larger median distance suggests a wrong coordinate system
 MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # files beside a capture
-SEEN_SUFFIX = "_seen.npy"  # FILE_seen.npy beside FILE.ply: number of views that see each face
+COUNTS_SUFFIX = "_seen.npy"  # FILE_seen.npy beside FILE.ply: number of views that see each face
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +33,7 @@ class Truth:
 
     path: Path
     surface: Mesh | np.ndarray  # a mesh, or points [P, 3]
-    seen: np.ndarray | None  # [F] number of training views that see each face
+    view_counts: np.ndarray | None  # [F] number of training views that see each face
 
 
 def read_truth(path: Path) -> Truth:
@@ -47,37 +44,37 @@ def read_truth(path: Path) -> Truth:
     if kind != "mesh":
         raise DataError(f"{path}: expected a mesh or points, got {kind} splats; use the true surface")
     mesh = read_mesh(path)
-    counts = path.with_name(path.stem + SEEN_SUFFIX)
+    counts = path.with_name(path.stem + COUNTS_SUFFIX)
     if not counts.exists():
         return Truth(path, mesh, None)
-    seen = read_npy(counts, "counts of views")
-    if seen.shape != (len(mesh.faces),):
-        raise DataError(f"{counts} must hold {len(mesh.faces)} counts (faces of {path.name}), got {list(seen.shape)}")
-    return Truth(path, mesh, seen)
+    views = read_npy(counts, "counts of views")
+    if views.shape != (len(mesh.faces),):
+        raise DataError(f"{counts} must hold {len(mesh.faces)} counts (faces of {path.name}), got {list(views.shape)}")
+    return Truth(path, mesh, views)
 
 
 @register_evaluator(GENERAL)
 class VisibleSurfaceEvaluator:
-    """Chamfer distance, precision, recall and F-score of a mesh, over the surface that the training views see."""
+    """Chamfer distance, precision, recall and F-score of a mesh, over the surface visible in the training views."""
 
     has_thresholds = True
 
-    def find(self, capture: Path, given: Path | None, tell: Tell) -> Truth | None:
-        """Return a mesh or points: the file ``given``, or one of ``MESH_TRUTHS`` in the folder."""
-        folder = given or capture
+    def find(self, capture: Path, ground_truth: Path | None, notify: Notify) -> Truth | None:
+        """Return a mesh or points: the file ``ground_truth``, or one of ``MESH_TRUTHS`` in the folder."""
+        folder = ground_truth or capture
         path = next((folder / name for name in MESH_TRUTHS if (folder / name).is_file()), None)
         if path is not None:
-            tell(f"ground truth: {path}")
-        elif given is not None and not given.is_dir():
-            path = given
-        elif given is not None:
+            notify(f"ground truth: {path}")
+        elif ground_truth is not None and not ground_truth.is_dir():
+            path = ground_truth
+        elif ground_truth is not None:
             raise DataError(
-                f"{given} must contain the official ground truth of a scene of DTU or Tanks and Temples, or one of "
-                f"{', '.join(MESH_TRUTHS)}, got neither for the capture {capture.name}; use a PLY or OBJ file"
+                f"{ground_truth} must contain the official ground truth of a scene of DTU or Tanks and Temples, or one "
+                f"of {', '.join(MESH_TRUTHS)}, got neither for the capture {capture.name}; use a PLY or OBJ file"
             )
         truth = None if path is None else read_truth(path)
-        if truth is not None and truth.seen is not None:
-            tell(f"view counts of true faces: {truth.path.stem}{SEEN_SUFFIX}")
+        if truth is not None and truth.view_counts is not None:
+            notify(f"view counts of true faces: {truth.path.stem}{COUNTS_SUFFIX}")
         return truth
 
     def score(
@@ -88,13 +85,13 @@ class VisibleSurfaceEvaluator:
             mesh,
             truth.surface,
             cameras=[view.camera for view in scene.train],
-            seen=truth.seen,
+            view_counts=truth.view_counts,
             T_truth_mesh=scene.T_metric_scene,
             thresholds=thresholds or None,
         )
-        facts = asdict(replace(score, clouds=None))
-        facts.pop("clouds")
-        rows = list(facts.pop("scores"))
+        scores = asdict(replace(score, clouds=None))
+        scores.pop("clouds")
+        rows = list(scores.pop("scores"))
         files = {}
         if score.clouds is not None:
             make_folder(folder)
@@ -104,7 +101,7 @@ class VisibleSurfaceEvaluator:
             "unit": "world units" if is_world else "mm",
             "ground_truth": str(truth.path),
             **{name: rows[0][name] for name in ("threshold", "precision", "recall", "f_score")},
-            **facts,
+            **scores,
             "thresholds": rows,
             "self_check": _self_check(score, truth),
             "protocol": asdict(VISIBLE_SURFACE),

@@ -83,7 +83,7 @@ def evaluate_run(
     if truth is not None and has_mesh:
         mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds
         on_event(Phase("scoring the surface", 0))
-        result["surface"] = score_surface(mesh, truth, trained.scene, folder=folder, tell=report, thresholds=thresholds)
+        result["surface"] = score_surface(mesh, truth, trained.scene, folder=folder, notify=report, thresholds=thresholds)
     elif truth is not None:
         on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():
