@@ -31,7 +31,7 @@ class FileReader:
     before_colmap: bool = False
 
     def detect(self, path: Path) -> bool:
-        """Whether the folder has the file."""
+        """Return whether the folder has the file."""
         return self.find(path) is not None
 
     def read(self, path: Path, *, downscale: int) -> Capture:
@@ -66,8 +66,8 @@ def reals(value: Any, count: int, where: str) -> np.ndarray:
     """Convert a list, or text separated by white space, to ``count`` finite numbers, or raise DataError."""
     items = value.split() if isinstance(value, str) else value
     if not isinstance(items, Sequence) or len(items) != count:
-        got = f"{len(items)}" if isinstance(items, Sequence) else type(value).__name__
-        raise DataError(f"{where} must be {count} numbers, got {got}")
+        actual = f"{len(items)}" if isinstance(items, Sequence) else type(value).__name__
+        raise DataError(f"{where} must be {count} numbers, got {actual}")
     return np.array([real(item, where) for item in items])
 
 
@@ -96,16 +96,16 @@ def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
 # -- point clouds ------------------------------------------------------------------------------------------------------
 _NAMES = ("points3D.ply", "points.ply", "sparse.ply", "sparse_points.ply", "tie_points.ply", "point_cloud.ply")
 _TRUTHS = ("mesh_gt.ply", "points_gt.ply")  # ground truth, not for training
-_FEWEST = 0.5  # smallest fraction of points that two cameras must see
-_FARTHEST = 100.0  # largest distance of these points, in camera extents
-_LOOKED_AT, _LOOKED_FROM = 2000, 100  # largest numbers of points and cameras in this test
+_MIN_VISIBLE = 0.5  # smallest fraction of points that must be visible to two cameras
+_MAX_DISTANCE = 100.0  # largest distance of these points, in camera extents
+_TESTED_POINTS, _TESTED_CAMERAS = 2000, 100  # largest numbers of points and cameras in this test
 
 
 def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud | None, list[str]]:
     """Return the points of a PLY file in ``root``, and a note if one is not used. A damaged file is a DataError.
 
-    Takes a file with a usual name (``points3D.ply``, ``points.ply``, ...), else the only one. Points may have been
-    exported in other coordinates: they are left out if two cameras see less than half of them.
+    Reads a file with a usual name (``points3D.ply``, ``points.ply``, ...), else the only one. Points may have been
+    exported in other coordinates, so they are not used if less than half of them are visible to two cameras.
     """
     beside = [path for path in files_ending(root, ".ply") if path.name.lower() not in _TRUTHS]
     named = [path for name in _NAMES if (path := in_any_case(root, name)) in beside]
@@ -119,32 +119,32 @@ def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud 
         return None, [f"no sparse points: {path.name} is not a point cloud"]
     cloud = read_points(path)
     points = PointCloud(np.asarray(cloud.points, dtype=np.float64), cloud.colors)
-    fraction = _seen(points.points, frames)
-    if fraction < _FEWEST:
+    fraction = _visible_fraction(points.points, frames)
+    if fraction < _MIN_VISIBLE:
         return None, [
-            f"no sparse points: two cameras see only {fraction:.0%} of the points of {path.name}, which seem to be in "
-            "other coordinates; export them in the coordinates of the cameras"
+            f"no sparse points: only {fraction:.0%} of the points of {path.name} are visible to two cameras; export "
+            "them in the coordinates of the cameras"
         ]
     return points, []
 
 
-def _seen(points: np.ndarray, frames: Sequence[PosedImage]) -> float:
-    """Return the fraction of points near the cameras that two of them see, ignoring distortion."""
-    some = points[np.linspace(0, len(points) - 1, min(len(points), _LOOKED_AT)).astype(int)]
+def _visible_fraction(points: np.ndarray, frames: Sequence[PosedImage]) -> float:
+    """Return the fraction of points near the cameras that are visible to two of them, ignoring distortion."""
+    some = points[np.linspace(0, len(points) - 1, min(len(points), _TESTED_POINTS)).astype(int)]
     some = some[np.isfinite(some).all(axis=1)]
     if not len(some):
         return 0.0
     centers = np.stack([-frame.T_cam_world[:3, :3].T @ frame.T_cam_world[:3, 3] for frame in frames])
     extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    near = np.linalg.norm(some - centers.mean(axis=0), axis=1) <= _FARTHEST * extent
-    seen = np.zeros(len(some), dtype=int)
-    for index in np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_FROM)).astype(int):
+    near = np.linalg.norm(some - centers.mean(axis=0), axis=1) <= _MAX_DISTANCE * extent
+    views = np.zeros(len(some), dtype=int)
+    for index in np.linspace(0, len(frames) - 1, min(len(frames), _TESTED_CAMERAS)).astype(int):
         k, T = frames[index].intrinsics, frames[index].T_cam_world
         x = some @ T[:3, :3].T + T[:3, 3]
         z = np.where(x[:, 2] > 0, x[:, 2], np.nan)
         u, v = k.fx * x[:, 0] / z + k.cx, k.fy * x[:, 1] / z + k.cy
-        seen += (u >= 0) & (u <= k.width) & (v >= 0) & (v <= k.height)  # comparisons with NaN are False
-    return float((near & (seen >= 2)).mean())
+        views += (u >= 0) & (u <= k.width) & (v >= 0) & (v <= k.height)  # comparisons with NaN are False
+    return float((near & (views >= 2)).mean())
 
 
 def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np.ndarray:

@@ -25,13 +25,13 @@ from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError, UnusableViewError
 from gs2d.io.meshes import read_points
 
-TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # of Blender
-CAMERAS = "transforms.json"  # of nerfstudio and instant-ngp
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # Blender
+CAMERAS = "transforms.json"  # nerfstudio and instant-ngp
 _LARGEST = 1e300  # JSON integers are unbounded
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE"}
 _PANORAMA = "EQUIRECTANGULAR"
-_NAMED = {"mask_path": FOLDER, "depth_file_path": DEPTHS, "normal_file_path": NORMALS}  # with the usual folders
+_NAMED = {"mask_path": FOLDER, "depth_file_path": DEPTHS, "normal_file_path": NORMALS}  # keys and usual folders
 _WHAT = {"mask_path": "mask", "depth_file_path": "depth map", "normal_file_path": "normal map"}
 
 
@@ -51,10 +51,10 @@ def read_blender(root: Path) -> Capture:
 
 
 def read_nerfstudio(root: Path) -> Capture:
-    """Read ``transforms.json`` of nerfstudio or instant-ngp; errors as of ``read_blender``.
+    """Read ``transforms.json`` of nerfstudio or instant-ngp; raises as ``read_blender`` does.
 
     Intrinsics and distortion are shared or per frame. Frames without a file are skipped and reported.
-    ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) give the split, ``ply_file_path`` the sparse
+    ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) are the split, ``ply_file_path`` the sparse
     points. Coordinates are those of the file; ``applied_transform`` and ``scale`` are already applied to them.
     """
     path = in_any_case(root, CAMERAS)
@@ -94,8 +94,8 @@ register_file_reader("nerfstudio", _NERFSTUDIO, __name__)
 def _read_meta(path: Path) -> dict[str, Any]:
     meta = read_json(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
-        got = f"the keys {sorted(meta)[:12]}" if isinstance(meta, dict) else type(meta).__name__
-        raise DataError(f'{path} must be an object with a list "frames", got {got}')
+        actual = f"the keys {sorted(meta)[:12]}" if isinstance(meta, dict) else type(meta).__name__
+        raise DataError(f'{path} must be an object with a list "frames", got {actual}')
     return meta
 
 
@@ -114,9 +114,9 @@ def _read_frames(entries: Sequence[_Entry], path: Path) -> tuple[list[PosedImage
     """Return the frames whose file exists, reasons for skipped ones, and notes."""
     root = path.parent
     photographs = _photographs([entry.name for entry in entries], path)
-    taken = {photo.path for photo in photographs.values() if photo.path is not None}
+    used = {photo.path for photo in photographs.values() if photo.path is not None}
     files = Files([root])
-    masks, depths, normals = (_named(entries, key, files, taken) for key in _NAMED)
+    masks, depths, normals = (_named(entries, key, files, used) for key in _NAMED)
     frames: list[PosedImage] = []
     skipped: list[str] = []
     lost: Counter[str] = Counter()
@@ -125,8 +125,8 @@ def _read_frames(entries: Sequence[_Entry], path: Path) -> tuple[list[PosedImage
         if photo.path is None:
             skipped.append(f"{entry.name}: {photo.reason}")
             continue
-        for key, found in zip(_NAMED, (masks, depths, normals), strict=True):
-            lost[_WHAT[key]] += entry.frame.get(key) is not None and found[index] is None
+        for key, paths in zip(_NAMED, (masks, depths, normals), strict=True):
+            lost[_WHAT[key]] += entry.frame.get(key) is not None and paths[index] is None
         maps, where = _maps_of(entry, depths[index], normals[index]), f"{entry.where} ({entry.name})"
         with skipping(entry.name, skipped):
             matrix = _required(entry.frame, "transform_matrix", entry.where)
@@ -153,15 +153,15 @@ def _entries(path: Path, meta: Mapping[str, Any], split: str | None) -> list[_En
     return entries
 
 
-def _named(entries: Sequence[_Entry], key: str, files: Files, taken: Collection[Path]) -> list[Path | None]:
+def _named(entries: Sequence[_Entry], key: str, files: Files, used: Collection[Path]) -> list[Path | None]:
     """Return the mask or map file of each frame; None if it names none or the file does not exist."""
     names = [
         None if entry.frame.get(key) is None else _relative(entry.frame[key], f"{entry.where}: {key}")
         for entry in entries
     ]
     others = set(_NAMED.values()) - {_NAMED[key]}
-    found = iter(files.match([[name] for name in names if name is not None], not_in=others, used=taken))
-    return [None if name is None else next(found).path for name in names]
+    matches = iter(files.match([[name] for name in names if name is not None], not_in=others, used=used))
+    return [None if name is None else next(matches).path for name in names]
 
 
 def _maps_of(entry: _Entry, depth: Path | None, normal: Path | None) -> MapFiles | None:

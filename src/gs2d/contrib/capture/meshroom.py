@@ -68,8 +68,8 @@ def _is_scene(path: Path) -> bool:
 def read_alicevision(root: Path) -> Capture:
     """Read the views with a pose, including those of rigs; other views are skipped.
 
-    Images are at the paths in the file, else found by name in ``images`` or elsewhere below the folder. Points are in
-    the file (``structure``), else in a PLY file beside it. A DataError about an invalid file or an unsupported camera
+    Images are at the paths in the file, else searched by name in ``images`` or elsewhere below the folder. Points are
+    in the file (``structure``), else in a PLY file beside it. A DataError about an invalid file or an unsupported camera
     names the file and the entry.
     """
     path = scene_file(root)
@@ -146,7 +146,7 @@ def _pose_id(view: Mapping[str, Any]) -> str:
 
 
 def _is_independent(view: Mapping[str, Any], views_of_pose: int) -> bool:
-    """Whether a view in a rig has its own pose; if the file does not state it, whether no other view shares it."""
+    """Return whether a view in a rig has its own pose; by default, if no other view shares the pose."""
     return str(view.get("isPoseIndependant", views_of_pose < 2)).lower() in ("true", "1")  # Meshroom's spelling
 
 

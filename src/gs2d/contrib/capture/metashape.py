@@ -69,7 +69,7 @@ def camera_file(root: Path) -> Path | None:
 def read_metashape(root: Path) -> Capture:
     """Read the cameras of Metashape; unaligned and disabled cameras and those of other components are skipped.
 
-    Images are found by their labels in ``images`` or elsewhere below the folder, sparse points in a PLY file beside the
+    Images are searched by label in ``images`` or elsewhere below the folder, sparse points in a PLY file beside the
     cameras (``camera_files.points_beside``). A DataError about an invalid file or an unsupported camera names the file
     and the entry.
     """
@@ -281,7 +281,7 @@ def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
 def _size(calibration: ElementTree.Element | None, sensor: ElementTree.Element, where: str) -> tuple[int, int]:
     """Return width and height, px, from the calibration or the sensor."""
     stated = (entry.find("resolution") for entry in (calibration, sensor) if entry is not None)
-    size = next((found for found in stated if found is not None), None)
+    size = next((resolution for resolution in stated if resolution is not None), None)
     if size is None:
         raise DataError(f"{where} must have a resolution, got none; export the cameras again")
     width, height = (whole(size.get(side), f"{where}: {side}") for side in ("width", "height"))

@@ -90,8 +90,8 @@ def _largest(path: Path) -> tuple[Mapping[str, Any], list[str]]:
     if isinstance(data, dict) and "shots" in data:
         data = [data]
     if not isinstance(data, list) or not data:
-        got = "an empty list" if data == [] else type(data).__name__
-        raise DataError(f"{path} must be a list of reconstructions (OpenSfM), got {got}; did the reconstruction fail?")
+        kind = "an empty list" if data == [] else type(data).__name__
+        raise DataError(f"{path} must be a list of reconstructions (OpenSfM), got {kind}; did the reconstruction fail?")
     every = [entries(item, f"{path}: reconstruction {index}") for index, item in enumerate(data)]
     counts = [len(entries(item.get("shots", {}), f"{path}: shots")) for item in every]
     best = int(np.argmax(counts))

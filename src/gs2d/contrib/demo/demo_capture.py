@@ -34,7 +34,7 @@ class SyntheticImage:
     """One rendered view."""
 
     rgba: np.ndarray  # [H, W, 4] uint8 sRGB, straight alpha; colour is 0 where alpha is 0
-    seen: np.ndarray  # [F] bool: visible triangles
+    visible: np.ndarray  # [F] bool: visible triangles
 
 
 def write_demo_capture(
@@ -86,12 +86,12 @@ def _photograph(
         split, k, camera = job
         result = render_image(scene, light, camera)
         write_image(root / split / f"r_{k}.png", result.rgba)
-        return result.seen
+        return result.visible
 
     counts = np.zeros(len(scene.patch.faces), dtype=np.int64)
     with ThreadPoolExecutor(workers) as pool:
-        for done, ((split, _, _), seen) in enumerate(zip(jobs, pool.map(image, jobs), strict=True)):
-            counts += seen & (split == "train")
+        for done, ((split, _, _), visible) in enumerate(zip(jobs, pool.map(image, jobs), strict=True)):
+            counts += visible & (split == "train")
             if on_progress is not None:
                 on_progress(done + 1, len(jobs))
 
@@ -160,12 +160,12 @@ def _transforms(split: str, cameras: Sequence[Camera]) -> dict[str, object]:
 def render_image(scene: ToyScene, light: BakedLight, camera: Camera) -> SyntheticImage:
     """Render one view: the mean of premultiplied linear colour over the rays of each pixel, stored as sRGB."""
     hits = cast_camera(scene.patch.vertices, scene.patch.faces, camera, samples=_SAMPLES)
-    seen = np.zeros(len(scene.patch.faces), dtype=bool)
-    seen[hits.face[hits.face >= 0]] = True
+    visible = np.zeros(len(scene.patch.faces), dtype=bool)
+    visible[hits.face[hits.face >= 0]] = True
     alpha = _pixel_means((hits.face >= 0).astype(np.float64)[..., None])
     color = _pixel_means(np.minimum(shade(scene, light, hits, camera.center), 1.0).astype(np.float64))
     rgba = np.concatenate([linear_to_srgb(color / np.maximum(alpha, 1e-12)) * (alpha > 0), alpha], axis=2)
-    return SyntheticImage(np.round(rgba * 255).astype(np.uint8), seen)
+    return SyntheticImage(np.round(rgba * 255).astype(np.uint8), visible)
 
 
 def _pixel_means(rays: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ def bake(
     sky_rays = _sphere(sky_directions)
     lamp_rays = _cone(LAMP, _LAMP_SPREAD, lamp_directions)
 
-    def seen(direction: np.ndarray) -> np.ndarray:
+    def unoccluded(direction: np.ndarray) -> np.ndarray:
         cosine = np.maximum(patch.normals @ direction, 0.0)
         facing = np.flatnonzero(cosine > 0)
         points = patch.vertices[facing] + _LIFT * patch.normals[facing]
@@ -48,11 +48,11 @@ def bake(
 
     with ThreadPoolExecutor(threads) as pool:
         sky = _sum(
-            pool.map(seen, sky_rays),
+            pool.map(unoccluded, sky_rays),
             lambda k, c: c[:, None] * sky_radiance(sky_rays[k : k + 1]),
             (len(patch.vertices), 3),
         )
-        lamp = _sum(pool.map(seen, lamp_rays), lambda k, c: c, (len(patch.vertices),))
+        lamp = _sum(pool.map(unoccluded, lamp_rays), lambda k, c: c, (len(patch.vertices),))
     return BakedLight(sky * 4 / sky_directions, lamp / lamp_directions)
 
 
@@ -143,7 +143,7 @@ def _albedo(scene: ToyScene, uv: np.ndarray, part: np.ndarray) -> np.ndarray:
 def occluded(
     vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, direction: np.ndarray, *, cells: int = 256
 ) -> np.ndarray:
-    """Whether the ray from each point towards a distant light hits a triangle, bool [Q].
+    """Return whether the ray from each point towards a distant light hits a triangle, bool [Q].
 
     Points [Q, 3] are origins moved off their surface; ``direction`` [3] is the unit vector towards the light. Projected
     along the light, a ray is a point and a triangle is a 2D triangle. Points and triangles are binned on a grid of
@@ -182,7 +182,7 @@ def occluded(
 
 
 def _is_under(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether a ray from each point [n, 3] along +z hits its triangle [n, 3, 3]."""
+    """Return whether a ray from each point [n, 3] along +z hits its triangle [n, 3, 3]."""
     x, y = (triangles[:, :, axis] - points[:, axis, None] for axis in (0, 1))
     # e[k] belongs to the edge from corner k + 1 to corner k + 2, opposite to corner k.
     e = [x[:, i] * y[:, j] - y[:, i] * x[:, j] for i, j in ((1, 2), (2, 0), (0, 1))]

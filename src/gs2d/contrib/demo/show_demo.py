@@ -1,4 +1,4 @@
-"""What ``gs2d demo`` does and prints."""
+"""The action of ``gs2d demo``."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Edit the splats of a run or a file.
 
 An edit of a run keeps the replaced file as ``edits/0001.ply``, ``edits/0002.ply`` ...; undoing renames the last one
-back. Attributes of splats that an edit does not concern keep their bits.
+back. An edit does not change the bits of other splats and attributes.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str,
 
     ``path`` is a run folder, or a file of flat splats, which needs ``out``, a file in the format of its ending. Without
     ``out`` the splats of the run are replaced, undoably. Returns ``file``, ``splats`` and ``before`` (numbers of
-    splats), and ``notes``. Raises RunError or DataError if the options contradict each other, the edit concerns no
-    splat or leaves none, or a file is damaged.
+    splats), and ``notes``. Raises RunError or DataError if the options contradict each other, the edit changes no splat
+    or deletes all, or a file is damaged.
     """
     path, out = Path(path), None if out is None else Path(out)
     _check(path, options, out)
@@ -72,8 +72,8 @@ def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str,
     return {"file": str(run.file(SPLATS)), "splats": len(edited), "before": len(before), "notes": notes}
 
 
-def edited_splats(splats: Splats, options: EditOptions, tell: Tell) -> Splats:
-    """Return splats after an edit; ``tell`` receives messages about a merged file."""
+def edited_splats(splats: Splats, options: EditOptions, warn: Tell) -> Splats:
+    """Return splats after an edit; ``warn`` receives messages about a merged file."""
     if options.keep_box is not None:
         return splats.rows(centers_inside(splats, options.keep_box, "--keep-box"))
     if options.delete_box is not None:
@@ -83,10 +83,10 @@ def edited_splats(splats: Splats, options: EditOptions, tell: Tell) -> Splats:
         return splats.rows(outside)
     if options.merge is None:
         return _moved(splats, options.transform)
-    other = _moved(splats_of(options.merge, tell), options.transform)
+    other = _moved(splats_of(options.merge, warn), options.transform)
     degrees = splats.sh_degree, other.sh_degree
     if degrees[0] != degrees[1]:
-        tell("SH degrees {} and {} are merged; the lower one gets coefficients of 0".format(*degrees))
+        warn("SH degrees {} and {} are merged; the lower one gets coefficients of 0".format(*degrees))
     return Gaussians.joined([Gaussians.of(splats), Gaussians.of(other)]).disks()
 
 
@@ -105,7 +105,7 @@ def _moved(splats: Splats, transform: Transform | None) -> Splats:
 
 
 def _check(path: Path, options: EditOptions, out: Path | None) -> None:
-    """Raise for options that contradict each other, or an edit that a run cannot have."""
+    """Raise for options that contradict each other, or an edit that is not possible in a run."""
     values = {"--keep-box": options.keep_box, "--delete-box": options.delete_box, "--merge": options.merge}
     edits = [name for name, value in values.items() if value is not None]
     edits += ["--undo"] * options.undo
@@ -127,28 +127,28 @@ def _check(path: Path, options: EditOptions, out: Path | None) -> None:
 
 
 def _versions(run: RunFolder) -> list[Path]:
-    """Return the kept splat files, oldest first; drops one that a killed edit left beside the same splats."""
-    kept = sorted(run.file(EDITS).glob("[0-9]*.ply"))
-    while kept and filecmp.cmp(kept[-1], run.file(SPLATS), shallow=False):
-        kept.pop().unlink()
-    return kept
+    """Return the splat files of earlier versions, oldest first; delete the copy of a killed edit."""
+    files = sorted(run.file(EDITS).glob("[0-9]*.ply"))
+    while files and filecmp.cmp(files[-1], run.file(SPLATS), shallow=False):
+        files.pop().unlink()
+    return files
 
 
 def _replace(run: RunFolder, before: Splats, edited: Splats) -> None:
-    """Replace the splats of a run and keep the file."""
+    """Replace the splats of a run and keep the old file."""
     same = len(before) == len(edited) and before.sh_degree == edited.sh_degree
     if same and all(bool((value == dict(edited.items())[name]).all()) for name, value in before.items()):
         raise RunError(f"the edit changes none of the {len(before):,} splats; nothing was written")
     versions = _versions(run)
     number = int(versions[-1].stem) + 1 if versions else 1
     make_folder(run.file(EDITS))
-    path, kept = run.file(SPLATS), run.file(EDITS) / f"{number:04d}.ply"
+    path, backup = run.file(SPLATS), run.file(EDITS) / f"{number:04d}.ply"
     try:
-        os.link(path, kept)  # the old file gets a second name; no bytes are copied
+        os.link(path, backup)  # the old file gets a second name; no bytes are copied
     except OSError:  # a file system without links
-        with atomic_write(kept) as file, open(path, "rb") as source:
+        with atomic_write(backup) as file, open(path, "rb") as source:
             shutil.copyfileobj(source, file)
-        shutil.copystat(path, kept)
+        shutil.copystat(path, backup)
     splat_ply.write_splats(path, edited)
 
 

@@ -1,8 +1,8 @@
 """Extract a mesh from depth maps by Delaunay tetrahedra and a minimum cut.
 
-The method of Labatut, Pons and Keriven (2009): oriented points are the corners of tetrahedra, lines of sight vote
-whether each of them is inside or outside, and the surface is the minimum cut between both. Most points are vertices of
-the fused volume, which are more accurate than single depth maps; the cut decides which of them belong to the surface.
+The method is that of Labatut, Pons and Keriven (2009). Oriented points are the corners of tetrahedra, lines of sight
+vote whether each tetrahedron is inside or outside, and the surface is the minimum cut between both. Most points are
+vertices of the fused volume, which are more accurate than single depth maps; the cut selects those on the surface.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from gs2d.meshing.tetrahedra import FACES, Tetrahedra, divide
 from gs2d.meshing.tsdf_volume import fusion_backend
 from gs2d.render.backends import Backend
 
-BYTES_A_POINT = 2500  # of tetrahedra, votes and cut, at their peak
+BYTES_A_POINT = 2500  # peak memory of tetrahedra, votes and cut
 LEAST_POINTS = 8
-LINES_A_POINT = 6  # of sight; 12 give the same surface in twice the time
+LINES_A_POINT = 6  # lines of sight; 12 give the same surface in twice the time
 LONG = 20.0  # spacings: an open surface has no longer edges; 10 leaves holes in walls, 40 frays at outlines
-SMALL = 0.002  # of the area of the largest component: the cut leaves few shreds, but parts things that touch
+SMALL = 0.002  # fraction of the area of the largest component: the cut leaves few fragments, but separates objects
 STEP = 8  # px between lines of sight that go past the scene
 EDGE = 3  # px: the outline of the scene is uncertain
-BEYOND = 0.75  # of the diagonal of the box: largest distance of the ends of these lines from its middle
-TAUBIN = (0.5, -0.53)  # steps of smoothing: shrink and grow (Taubin 1995)
+BEYOND = 0.75  # largest distance of the ends of these lines from the box centre, as a fraction of its diagonal
+TAUBIN = (0.5, -0.53)  # smoothing steps: shrink and grow (Taubin 1995)
 TAUBIN_ROUNDS = 2
 
 
@@ -62,8 +62,8 @@ def extract_delaunay(
     """Extract a mesh from depth maps as the minimum cut of tetrahedra.
 
     Parameters and errors are those of ``extract``, but ``voxel`` is also half the distance of the points, ``max_bytes``
-    limits their number, and it is a ProtocolError if there are fewer than two views or no surface that two of them see.
-    ``volume_bytes`` of the result includes the tetrahedra.
+    limits their number, and a ProtocolError is raised if there are fewer than two views or no surface is visible in two
+    of them. ``volume_bytes`` of the result includes the tetrahedra.
     """
     backend = fusion_backend(backend)
     spool, samples = spooled(frames, threads)
@@ -109,7 +109,7 @@ def _points(fused: Mesh, spool: Spool, limits: FusionBounds, options: ExtractOpt
     points = points.joined(settle(others, spool, limits))
     if len(points.xyz) < LEAST_POINTS:
         raise ProtocolError(
-            f"expected surface that two or more views see, got {len(points.xyz)} points; check the box and the cameras"
+            f"expected surface visible in two or more views, got {len(points.xyz)} points; check the box and cameras"
         )
     return points
 
@@ -117,22 +117,22 @@ def _points(fused: Mesh, spool: Spool, limits: FusionBounds, options: ExtractOpt
 def _sight(points: OrientedPoints, spool: Spool, limits: FusionBounds, library: Library) -> tuple[Tetrahedra, Lines]:
     """Return tetrahedra of the points and of points beyond the scene, and the lines of sight to both."""
     centers = np.array([camera.center for camera in spool.cameras])
-    seen, cameras, weights = sight_lines(points, spool, limits, most=LINES_A_POINT)
+    rows, cameras, weights = sight_lines(points, spool, limits, most=LINES_A_POINT)
     past, past_cameras = _beyond(spool, limits)
     space = divide(np.concatenate([points.xyz, past]), centers, library)
-    sigma = np.maximum(points.spread, points.spacing)[seen]
+    sigma = np.maximum(points.spread, points.spacing)[rows]
     lines = Lines(
-        np.concatenate([seen, len(points.xyz) + np.arange(len(past))]).astype(np.int32),
+        np.concatenate([rows, len(points.xyz) + np.arange(len(past))]).astype(np.int32),
         np.concatenate([centers[cameras], centers[past_cameras]]),
         np.concatenate([sigma, np.full(len(past), limits.voxel)]),
         np.concatenate([weights, np.ones(len(past))]),
-        len(seen),
+        len(rows),
     )
     return space, lines
 
 
 def _beyond(spool: Spool, limits: FusionBounds) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [S, 3] in free space or beyond the box that views see past the scene, and their cameras [S]."""
+    """Return points [S, 3] in free space or beyond the box, on rays past the scene, and their cameras [S]."""
     lower, upper = np.asarray(limits.lower), np.asarray(limits.upper)
     middle, radius = (lower + upper) / 2, BEYOND * float(np.linalg.norm(upper - lower))
     points, cameras = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
@@ -159,9 +159,9 @@ def _beyond(spool: Spool, limits: FusionBounds) -> tuple[np.ndarray, np.ndarray]
 
 
 def _surface(space: Tetrahedra, points: OrientedPoints, out: np.ndarray, *, closed: bool) -> Mesh:
-    """Return the facets between inside and outside, counter-clockwise seen from outside.
+    """Return the facets between inside and outside, counter-clockwise from outside.
 
-    An open surface has no facets with long edges, which close what no view shows, and none whose points are seen from
+    An open surface has no facets with long edges, which close invisible regions, and none whose points are visible from
     the other side, which are the back of a wall. A closed one has no edges with more than two faces.
     """
     out = _without_touching_edges(space, out) if closed else out

@@ -1,8 +1,8 @@
-"""Oriented points of the surface, with the views that see each.
+"""Compute oriented points of the surface, with the number of views that observe each.
 
 Most points are vertices of the fused surface, which average the depth maps of all views, thinned to one to two pixels.
 Where fusion has no surface, pixels of the depth maps are merged instead; each moves along its normal to the mean of the
-depth maps that see it.
+depth maps that observe it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from gs2d.meshing.simplify import pixel_scale
 from gs2d.meshing.texture import vertex_normals
 
 PIXELS_APART = 1.5  # width of a voxel: finer ones have more noise than shape
-ROUNDS = 2  # of moving the points; a third one changes nothing
+ROUNDS = 2  # iterations of moving the points; a third one changes nothing
 KEYS = 21  # bits of a voxel coordinate
-MERGE_AT_ONCE = 1 << 21  # pixels that wait for being merged
-APART = 2.0  # spacings: merged pixels closer to a vertex of the fused surface are left out
-SIDES = 60  # bit of a key where the side begins that a vertex faces
+MERGE_AT_ONCE = 1 << 21  # pixels that are merged together
+APART = 2.0  # spacings: merged pixels closer to a vertex of the fused surface are dropped
+SIDES = 60  # first bit of the side that a vertex faces, in a key
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class OrientedPoints:
     spacing: np.ndarray  # [P] float32: width of the voxel of the point, world units
     # [P] float32: standard deviation of the depth maps around the point, along its normal, world units
     spread: np.ndarray
-    views: np.ndarray  # [P] int32: number of views that see the point
+    views: np.ndarray  # [P] int32: number of views that observe the point
     colors: np.ndarray | None  # [P, 3] uint8
 
     def rows(self, rows: np.ndarray) -> OrientedPoints:
@@ -75,10 +75,10 @@ def merge_vertices(mesh: Mesh, cameras: Sequence[Camera], limits: FusionBounds, 
 
 
 def merge_pixels(maps: Iterable[DepthMap], limits: FusionBounds, *, apart: float) -> OrientedPoints:
-    """Merge the valid pixels of all maps in voxels of 2^k times a base width, by the width of a pixel there.
+    """Merge the valid pixels of all maps in voxels of 2^k times a base width, which is chosen by the width of a pixel.
 
-    ``limits`` are the box and depth limit of the pixels; ``apart`` is the width of a voxel, px. Where a view shows a
-    part of the surface at a finer scale than others, its voxels alone stay.
+    ``limits`` are the box and depth limit of the pixels; ``apart`` is the width of a voxel, px. Where voxels of several
+    scales overlap, only the finest remain.
     """
     base = apart * limits.pixel_footprint
     merged: list[_Voxels] = []
@@ -106,7 +106,7 @@ def _points(merged: _Voxels, base: float, *, colored: bool) -> OrientedPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Voxels:
-    """Sums in voxels: of weight, weighted position, weighted normal and possibly weighted colour."""
+    """Sums of weight, weighted position, weighted normal and possibly weighted colour in voxels."""
 
     keys: np.ndarray  # [N] uint64
     levels: np.ndarray  # [N] int8
@@ -157,31 +157,31 @@ def _merged(parts: list[_Voxels]) -> _Voxels:
 
 
 def _finest(voxels: _Voxels, lower: np.ndarray, base: float) -> _Voxels:
-    """Drop voxels in which finer ones are."""
+    """Drop voxels that contain finer ones."""
     xyz = voxels.sums[:, 1:4] / voxels.sums[:, :1]
-    kept = np.ones(len(xyz), bool)
+    keep = np.ones(len(xyz), bool)
     for level in np.unique(voxels.levels):
-        here, finer = np.flatnonzero(voxels.levels == level), np.flatnonzero((voxels.levels < level) & kept)
-        taken = _keys(xyz[finer], np.full(len(finer), level), lower, base)
-        kept[here] = ~np.isin(voxels.keys[here], taken)
-    return _Voxels(voxels.keys[kept], voxels.levels[kept], voxels.sums[kept])
+        here, finer = np.flatnonzero(voxels.levels == level), np.flatnonzero((voxels.levels < level) & keep)
+        covered = _keys(xyz[finer], np.full(len(finer), level), lower, base)
+        keep[here] = ~np.isin(voxels.keys[here], covered)
+    return _Voxels(voxels.keys[keep], voxels.levels[keep], voxels.sums[keep])
 
 
 @dataclass(frozen=True, eq=False)
-class _Agreeing:
-    """Points that a view sees, and weights of those that it sees through."""
+class _Observation:
+    """Points that a view observes, and points in the free space in front of its surface."""
 
-    rows: np.ndarray  # [S] of points in front
+    rows: np.ndarray  # [S] of observed points
     moves: np.ndarray  # [S] float32 world units along the normal, to the depth of the view
     weights: np.ndarray  # [S] float32
     facing: np.ndarray  # [S] float32 cosine between ray and normal
     pixels: np.ndarray  # [S] of the view
-    through: np.ndarray  # [T] rows of points that the view sees through
-    against: np.ndarray  # [T] float32
+    through: np.ndarray  # [T] rows of points in free space
+    against: np.ndarray  # [T] float32 their weights
 
 
-def _look(item: DepthMap, view: DepthSampler, points: OrientedPoints, reach: np.ndarray) -> _Agreeing:
-    """Compare points with a view, which sees those within ``reach`` [P] of its depth, along their normals."""
+def _observe(item: DepthMap, view: DepthSampler, points: OrientedPoints, reach: np.ndarray) -> _Observation:
+    """Compare points with a view, which observes those within ``reach`` [P] of its depth, along their normals."""
     projected = points.xyz @ view.projection[:, :3].T + view.projection[:, 3]
     z = projected[:, 2].copy()
     z[~(z > 0)] = np.nan
@@ -194,15 +194,15 @@ def _look(item: DepthMap, view: DepthSampler, points: OrientedPoints, reach: np.
     move = -residual / depth * facing * np.linalg.norm(ray, axis=1)  # along the normal; beyond the point: negative
     weight = np.ones(len(rows), np.float32) if view.weight is None else view.weight[pixel]
     valid = view.depth[pixel] > 0
-    seen = np.flatnonzero(valid & (np.abs(move) <= reach[rows]) & (facing > GRAZING))
+    visible = np.flatnonzero(valid & (np.abs(move) <= reach[rows]) & (facing > GRAZING))
     endless = np.pad(np.isinf(item.depth), 1).ravel()[pixel]
     through = np.flatnonzero(endless | (valid & (residual * np.abs(facing) > 2 * reach[rows])))
-    return _Agreeing(
-        rows[seen],
-        move[seen].astype(np.float32),
-        weight[seen],
-        facing[seen].astype(np.float32),
-        pixel[seen],
+    return _Observation(
+        rows[visible],
+        move[visible].astype(np.float32),
+        weight[visible],
+        facing[visible].astype(np.float32),
+        pixel[visible],
         rows[through],
         weight[through].astype(np.float32),
     )
@@ -211,9 +211,9 @@ def _look(item: DepthMap, view: DepthSampler, points: OrientedPoints, reach: np.
 def settle(points: OrientedPoints, spool: Spool, limits: FusionBounds, *, rounds: int = ROUNDS) -> OrientedPoints:
     """Move points along their normals to the mean of the depths within the truncation, ``rounds`` times.
 
-    Depths weigh by the inverse of the cosine between ray and normal, as in a TSDF: a mean of distances along the rays.
-    Slanted views see less of the dents that highlights leave. Points that two views do not see, or that more views see
-    through than see, are dropped. With no rounds, points stay where they are.
+    Depths are weighted by the inverse of the cosine between ray and normal, as in a TSDF, which is a mean of distances
+    along the rays: highlights make smaller dents in slanted views. Points are dropped if fewer than two views observe
+    them, or the weight of free space is larger. With no rounds, points stay where they are.
     """
     reach = np.full(len(points.xyz), limits.truncation)
     for number in range(max(rounds, 1)):
@@ -223,21 +223,21 @@ def settle(points: OrientedPoints, spool: Spool, limits: FusionBounds, *, rounds
         shade = np.zeros((count, 3))
         for item in spool:
             view = make_sampler(item, limits)
-            seen = _look(item, view, points, reach)
-            views[seen.rows] += 1
-            support[seen.rows] += seen.weights
-            slanted = seen.weights / seen.facing
-            total[seen.rows] += slanted
-            first[seen.rows] += slanted * seen.moves
-            second[seen.rows] += slanted * seen.moves**2
-            against[seen.through] += seen.against
+            observed = _observe(item, view, points, reach)
+            views[observed.rows] += 1
+            support[observed.rows] += observed.weights
+            slanted = observed.weights / observed.facing
+            total[observed.rows] += slanted
+            first[observed.rows] += slanted * observed.moves
+            second[observed.rows] += slanted * observed.moves**2
+            against[observed.through] += observed.against
             if number >= rounds - 1 and view.color is not None:
-                shade[seen.rows] += slanted[:, None] * view.color[seen.pixels]
+                shade[observed.rows] += slanted[:, None] * view.color[observed.pixels]
         weight = np.maximum(total, 1e-30)
         move = first / weight
         spread = np.sqrt(np.maximum(second / weight - move**2, 0))
         colors = np.rint(shade / weight[:, None]).astype(np.uint8) if points.colors is None else points.colors
-        kept = np.flatnonzero((views >= min(VIEWS, len(spool))) & (support > against))
+        keep = np.flatnonzero((views >= min(VIEWS, len(spool))) & (support > against))
         points = OrientedPoints(
             points.xyz + move[:, None] * points.normals if rounds else points.xyz,
             points.normals,
@@ -245,30 +245,30 @@ def settle(points: OrientedPoints, spool: Spool, limits: FusionBounds, *, rounds
             spread.astype(np.float32),
             views,
             colors,
-        ).rows(kept)
-        reach = reach[kept]
+        ).rows(keep)
+        reach = reach[keep]
     return points
 
 
 def sight_lines(
     points: OrientedPoints, spool: Spool, limits: FusionBounds, *, most: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return at most about ``most`` lines of sight a point, chosen by a fixed rule and weighted by the rest.
+    """Return about ``most`` lines of sight per point at most, selected by a fixed rule.
 
-    Returns their points [L] int32, cameras [L] int32 and weights [L] float32: the weight of the pixel, times the lines
-    that the chosen one stands for.
+    Returns their points [L] int32, cameras [L] int32 and weights [L] float32: the weight of the pixel, times the number
+    of lines that the selected one represents.
     """
     reach = np.full(len(points.xyz), limits.truncation)
     share = np.minimum(1.0, most / np.maximum(points.views, 1))
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for number, item in enumerate(spool):
-        seen = _look(item, make_sampler(item, limits), points, reach)
+        observed = _observe(item, make_sampler(item, limits), points, reach)
         # a hash of point and view in [0, 1)
         draw = (
-            (seen.rows.astype(np.uint64) * np.uint64(2654435761) + np.uint64(number * 40503)) >> np.uint64(8)
+            (observed.rows.astype(np.uint64) * np.uint64(2654435761) + np.uint64(number * 40503)) >> np.uint64(8)
         ) & np.uint64(0xFFFF)
-        chosen = draw / 65536.0 < share[seen.rows]
-        rows = seen.rows[chosen]
-        found.append((rows, np.full(len(rows), number), seen.weights[chosen] / share[rows]))
-    rows, cameras, weights = (np.concatenate(part) for part in zip(*found, strict=True))
+        chosen = draw / 65536.0 < share[observed.rows]
+        rows = observed.rows[chosen]
+        parts.append((rows, np.full(len(rows), number), observed.weights[chosen] / share[rows]))
+    rows, cameras, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
     return rows.astype(np.int32), cameras.astype(np.int32), weights.astype(np.float32)

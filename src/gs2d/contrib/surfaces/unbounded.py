@@ -83,7 +83,7 @@ class TsdfCascade:
 
     @property
     def dims(self) -> tuple[int, int, int]:
-        """Blocks along x, y, z of every level."""
+        """Number of blocks along x, y, z of every level."""
         return (self.voxels // BLOCK,) * 3
 
     @property
@@ -119,7 +119,7 @@ def derive_cascade(
     The innermost cube contains ``bbox`` [2, 3], or the 1st to 99th percentile of the nearer half of the points. Its
     side has ``resolution`` voxels, not finer than half the median pixel of the nearer half; ``voxel`` and
     ``truncation`` (world units) are those of this level. The outermost contains all points up to the depth limit: 1.25
-    times the 99.5th percentile of depth, but not beyond the depth that is known to within the truncation
+    times the 99.5th percentile of depth, but not beyond the depth whose uncertainty equals the truncation
     (``valid_depth``), where sky and textureless walls create false surfaces. Raises ProtocolError if no pixel has a
     depth, or a requested limit is invalid.
     """
@@ -143,10 +143,10 @@ def derive_cascade(
     limit = depth_limit
     if limit is None:
         limit = min(high * 1.25, max(valid_depth(cameras, band / half), FAR_FACTOR * median))
-    kept = depths <= limit
-    if not kept.any():
+    within = depths <= limit
+    if not within.any():
         raise ProtocolError(f"depth_limit must exceed the nearest depth, {depths.min():.4g} world units, got {limit:g}")
-    reach = float(np.abs(xyz[kept] - center).max()) / half
+    reach = float(np.abs(xyz[within] - center).max()) / half
     count = min(MAX_LEVELS, 1 + int(np.ceil(np.log2(max(reach, 1.0)))))
     levels = []
     for k in range(count):
@@ -163,7 +163,7 @@ def derive_cascade(
                 depth_median=median,
                 depth_high=high,
                 pixel_footprint=footprint,
-                cut_fraction=float(1 - kept.mean()),
+                cut_fraction=float(1 - within.mean()),
             )
         )
     middle = (float(center[0]), float(center[1]), float(center[2]))
@@ -184,7 +184,7 @@ def valid_depth(cameras: Sequence[Camera], band: float) -> float:
 
 
 # -- the surface -------------------------------------------------------------------------------------------------------
-FAR_VIEWS = 5.0  # smallest weight of known voxels outside the innermost level: few views agree on a false sky depth
+FAR_VIEWS = 5.0  # smallest weight of valid voxels outside the innermost level: few views agree on a false sky depth
 
 
 def find_cascade_blocks(
@@ -193,12 +193,12 @@ def find_cascade_blocks(
     *,
     max_bytes: int = 4 << 30,
 ) -> tuple[VolumeBlocks, ...]:
-    """Find the blocks of each level; parameters and errors as for ``find_blocks``, with a common limit of memory."""
+    """Find the blocks of each level; parameters and errors as for ``find_blocks``, with a common memory limit."""
     check_truncation(cascade.levels[0])
     block_grid(cascade.levels[0])  # refuses voxels that are too small
     budget = Budget(cascade.levels[0], max_bytes, side=2 * cascade.half, step=STEP)
     keys, colored = gather_keys(frames, lambda item: _touched(item, cascade), budget)
-    return tuple(VolumeBlocks(cascade.dims, found, colored) for found in keys)
+    return tuple(VolumeBlocks(cascade.dims, level, colored) for level in keys)
 
 
 def _empty(blocks: VolumeBlocks, limits: FusionBounds) -> Volume:
@@ -238,7 +238,7 @@ def _touched(item: DepthMap, cascade: TsdfCascade) -> list[np.ndarray]:
     """Return the keys of each level's own blocks near the surface of a depth map."""
     distance = _distances(item, cascade)
     first, last = cascade.hole
-    found = []
+    touched = []
     for k, limits in enumerate(cascade.levels):
         # points outside the level whose truncation band may reach into it
         margin = (3 * limits.truncation + 2 * BLOCK * limits.voxel) / cascade.half
@@ -254,8 +254,8 @@ def _touched(item: DepthMap, cascade: TsdfCascade) -> list[np.ndarray]:
         blocks = blocks[((blocks >= 0) & (blocks < cascade.dims[0])).all(axis=1)]
         if k:
             blocks = blocks[~((blocks >= first) & (blocks < last)).all(axis=1)]
-        found.append((blocks[:, 0] * cascade.dims[1] + blocks[:, 1]) * cascade.dims[2] + blocks[:, 2])
-    return found
+        touched.append((blocks[:, 0] * cascade.dims[1] + blocks[:, 1]) * cascade.dims[2] + blocks[:, 2])
+    return touched
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +263,7 @@ class _Nodes:
     """The voxels of several levels with a common numbering: offset of the level + 512 * row + voxel."""
 
     volumes: Sequence[Volume]
-    known_from: Sequence[float]
+    min_weights: Sequence[float]
 
     @property
     def offsets(self) -> np.ndarray:
@@ -292,10 +292,10 @@ class _Nodes:
         return out
 
     def valid(self, ids: np.ndarray) -> np.ndarray:
-        """Whether voxels have enough weight to be known."""
+        """Return whether voxels have enough weight to be valid."""
         out = np.zeros(ids.shape, bool)
         for k, here, local in self._by_level(ids):
-            out[here] = self.volumes[k].weight.reshape(-1)[local] >= max(self.known_from[k], 1e-12)
+            out[here] = self.volumes[k].weight.reshape(-1)[local] >= max(self.min_weights[k], 1e-12)
         return out
 
     def positions(self, ids: np.ndarray) -> np.ndarray:
@@ -324,7 +324,7 @@ def fused_cascade_surface(
     Levels are fused slab by slab (``slabs``), several small slabs at a time; the mesh does not depend on their size.
     Blocks at the border between two levels stay in memory until both are finished. ``frames`` are read once for each
     batch of slabs: a sequence or a ``Spool``. ``blocks`` of each level are from ``find_cascade_blocks``. ``min_weight``
-    and ``far_weight`` are the smallest weights of known voxels in the innermost level, and in all others.
+    and ``far_weight`` are the smallest weights of valid voxels in the innermost level, and in all others.
     """
     surface = CascadeSurface(cascade, [len(part.keys) for part in blocks], min_weight, far_weight)
     for level, part in enumerate(blocks):
@@ -357,13 +357,13 @@ def _batches(blocks: Sequence[VolumeBlocks], slab_bytes: int) -> Iterator[list[t
 
 
 class CascadeSurface:
-    """Collects the surface of levels that are processed in parts. Nodes are numbered over all levels (``_Nodes``)."""
+    """Collect the surface of levels that are processed in parts. Nodes are numbered over all levels (``_Nodes``)."""
 
     def __init__(self, cascade: TsdfCascade, counts: Sequence[int], min_weight: float, far_weight: float) -> None:
         self._cascade = cascade
-        self._known_from = [min_weight if k == 0 else max(min_weight, far_weight) for k in range(len(counts))]
+        self._min_weights = [min_weight if k == 0 else max(min_weight, far_weight) for k in range(len(counts))]
         self._offsets = np.concatenate([[0], np.cumsum([count * VOXELS for count in counts])])
-        self._kept: list[list[tuple[Volume, np.ndarray]]] = [[] for _ in counts]  # border blocks, and their rows
+        self._border: list[list[tuple[Volume, np.ndarray]]] = [[] for _ in counts]  # border blocks, and their rows
         self._pairs = [np.zeros((0, 2), np.int64)]
         self._triangles = [np.zeros((0, 3), np.int64)]
         self._vertices = [np.zeros((0, 3), np.float32)]
@@ -372,12 +372,12 @@ class CascadeSurface:
 
     def add(self, volume: Volume, level: int, start: int, own: int) -> None:
         """Add the cells of the first ``own`` blocks of a part that starts at block ``start`` of its level."""
-        edges, faces, ends = cell_surface(volume, self._known_from[level], own)
+        edges, faces, ends = cell_surface(volume, self._min_weights[level], own)
         pairs = np.stack([edges // 3, ends], axis=1)
-        nodes = _Nodes([volume], [self._known_from[level]])
+        nodes = _Nodes([volume], [self._min_weights[level]])
         self._append(nodes, pairs, pairs + (self._offsets[level] + start * VOXELS), faces)
         rows = np.flatnonzero(self._at_joins(volume.blocks[:own]))
-        self._kept[level].append((_rows_of(volume, rows), rows + start))
+        self._border[level].append((_rows_of(volume, rows), rows + start))
 
     def _append(self, nodes: _Nodes, local: np.ndarray, pairs: np.ndarray, faces: np.ndarray) -> None:
         vertices, colors = _vertices(nodes, local[:, 0], local[:, 1])
@@ -395,16 +395,16 @@ class CascadeSurface:
 
     def mesh(self) -> Mesh:
         """Connect the levels, and return the mesh."""
-        levels = [_kept_level(parts) for parts in self._kept]
+        levels = [_joined_level(parts) for parts in self._border]
         for k in range(len(levels) - 1):
-            volumes, rows = [volume for volume, _ in levels[k : k + 2]], [kept for _, kept in levels[k : k + 2]]
-            nodes = _Nodes(volumes, self._known_from[k : k + 2])
+            volumes, rows = zip(*levels[k : k + 2], strict=True)
+            nodes = _Nodes(volumes, self._min_weights[k : k + 2])
             inner, outer = nodes.offsets[:2]
             cells = _join_cells(volumes[0], volumes[1], self._cascade, inner, outer)
             local = _join_triangles(nodes, cells).reshape(-1, 2)
             numbers = [
-                (self._offsets[k + i] + kept[:, None] * VOXELS + np.arange(VOXELS)).reshape(-1)
-                for i, kept in enumerate(rows)
+                (self._offsets[k + i] + level_rows[:, None] * VOXELS + np.arange(VOXELS)).reshape(-1)
+                for i, level_rows in enumerate(rows)
             ]
             corners = np.arange(len(local)).reshape(-1, 3)
             self._append(nodes, local, np.concatenate(numbers)[local], corners)
@@ -429,8 +429,8 @@ def _rows_of(volume: Volume, rows: np.ndarray) -> Volume:
     return replace(volume, **some)
 
 
-def _kept_level(parts: Sequence[tuple[Volume, np.ndarray]]) -> tuple[Volume, np.ndarray]:
-    """Merge the kept blocks of a level into one volume; also returns their rows in the level."""
+def _joined_level(parts: Sequence[tuple[Volume, np.ndarray]]) -> tuple[Volume, np.ndarray]:
+    """Merge the border blocks of a level into one volume; also return their rows in the level."""
     whole = parts[0][0]
     there = [name for name in ARRAYS if getattr(whole, name) is not None]
     every: dict[str, Any] = {name: np.concatenate([getattr(volume, name) for volume, _ in parts]) for name in there}
