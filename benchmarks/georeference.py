@@ -121,7 +121,7 @@ def seen_at(camera: Camera, place: np.ndarray) -> np.ndarray | None:
 def judged(found: Georeference, centers: np.ndarray, true: np.ndarray, scale: float) -> dict[str, Any]:
     """Return the true errors and the reported errors of a georeference; cameras are [V, 3], of the run and true."""
     off = np.linalg.norm(found.to_world(centers) - WORLD - true, axis=1)
-    told = found.facts.get("scale_error")
+    told = found.details.get("scale_error")
     return {
         "scale_error": abs(found.scale / scale - 1),
         "told": None if told is None else float(told),

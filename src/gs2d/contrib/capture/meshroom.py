@@ -69,8 +69,8 @@ def read_alicevision(root: Path) -> Capture:
     """Read the views with a pose, including those of rigs; other views are skipped.
 
     Images are at the paths in the file, else searched by name in ``images`` or elsewhere below the folder. Points are
-    in the file (``structure``), else in a PLY file beside it. A DataError about an invalid file or an unsupported camera
-    names the file and the entry.
+    in the file (``structure``), else in a PLY file beside it. A DataError about an invalid file or an unsupported
+    camera names the file and the entry.
     """
     path = scene_file(root)
     if path is None:

@@ -95,7 +95,7 @@ def locate(points: Sequence[ControlPoint], views: Sequence[View], held_out: Sequ
     """
     if unknown := [name for name in held_out if name not in {point.name for point in points}]:
         raise DataError(
-            f"check_points must name control points, got {unknown[0]}; known are "
+            f"check_points must name control points, got {unknown[0]}; use one of "
             f"{', '.join(point.name for point in points[:8])}"
         )
     by_name = {view.name: view for view in views}
@@ -107,19 +107,19 @@ def locate(points: Sequence[ControlPoint], views: Sequence[View], held_out: Sequ
             source.append(point.run)
             pixels.append(math.nan)
             continue
-        seen = []
+        marked = []
         for photo in point.marks:
             view = by_name.get(photo) or (by_file.get(photo) if files[photo] == 1 else None)
             if view is None:
                 many = f"{files[photo]} photographs of" if files[photo] else "no photograph of"
                 raise DataError(f"{point.name} is marked in {photo}: the run has {many} that name")
-            seen.append(view)
-        found = triangulate(seen, np.array(list(point.marks.values())), point.name)
-        source.append(found.point)
-        pixels.append(float(np.sqrt(np.mean(found.pixels**2))))
-        if found.pixels.max() > DOUBTFUL_PIXELS:
-            photo = list(point.marks)[int(found.pixels.argmax())]
-            doubts.append(f"{point.name} is {found.pixels.max():.1f} px from its mark in {photo}: check that mark")
+            marked.append(view)
+        result = triangulate(marked, np.array(list(point.marks.values())), point.name)
+        source.append(result.point)
+        pixels.append(float(np.sqrt(np.mean(result.pixels**2))))
+        if result.pixels.max() > DOUBTFUL_PIXELS:
+            photo = list(point.marks)[int(result.pixels.argmax())]
+            doubts.append(f"{point.name} is {result.pixels.max():.1f} px from its mark in {photo}: check that mark")
     return Located(
         tuple(point.name for point in points),
         np.array(source),

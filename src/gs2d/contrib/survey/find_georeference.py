@@ -35,9 +35,9 @@ from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.training.events import OnEvent, counted, ignore
 
 SOURCES = ("gps", "positions", "control", "known_distance", "markers")
-_FEWEST = 3  # camera positions
-# Limits beyond which a result is reported as doubtful:
-_LEFT = 0.3  # fraction of outliers
+_FEWEST = 3  # smallest number of camera positions
+# Limits beyond which a warning is reported:
+_MAX_OUTLIERS = 0.3  # fraction of outliers
 _SCALE_ERROR = 0.02  # relative standard error of the scale
 _TILTED = 20.0  # degrees between up from the positions and up from the cameras
 _NOISY = 0.2  # rms relative to the spread of the positions
@@ -52,7 +52,7 @@ def georeference_run(
     options: GeoreferenceOptions,
     on_event: OnEvent = ignore,
 ) -> Georeference | None:
-    """Find the georeference of a run and write ``georeference.json``; without a source, read it.
+    """Compute the georeference of a run and write ``georeference.json``; without a source, read it.
 
     Other files of the run keep their coordinates. Returns None if the run has none, or it was removed.
     """
@@ -65,10 +65,10 @@ def georeference_run(
         return None
     if not sources:
         return read_georeference(run.path)
-    found = _found(run, options, sources[0], on_event)
+    georeference = _fitted(run, options, sources[0], on_event)
     with run.locked():
-        write_georeference(run.path, found)
-    return found
+        write_georeference(run.path, georeference)
+    return georeference
 
 
 def _check(options: GeoreferenceOptions, chosen: Sequence[str]) -> None:
@@ -96,7 +96,7 @@ def _is_set(value: object) -> bool:
     return value is not None and value is not False and value != ()
 
 
-def _found(run: RunFolder, options: GeoreferenceOptions, source: str, on_event: OnEvent) -> Georeference:
+def _fitted(run: RunFolder, options: GeoreferenceOptions, source: str, on_event: OnEvent) -> Georeference:
     if source == "known_distance":
         assert options.known_distance is not None
         level, origin = _up(options, lambda: [view.camera for view in _views(run, on_event)])
@@ -128,17 +128,17 @@ def _up(options: GeoreferenceOptions, cameras: Callable[[], Sequence[Camera]]) -
 
 
 # -- scale alone -------------------------------------------------------------------------------------------------------
-def _of_known_distance(known: Sequence[float], up: np.ndarray, up_source: str) -> Georeference:
-    ends, metres = np.array(known[:6]).reshape(2, 3), known[6]
-    if not np.isfinite(known).all() or not metres > 0:
-        raise RunError(f"--known-distance must be six finite numbers and a positive distance, got {known}")
+def _of_known_distance(distance: Sequence[float], up: np.ndarray, up_source: str) -> Georeference:
+    ends, metres = np.array(distance[:6]).reshape(2, 3), distance[6]
+    if not np.isfinite(distance).all() or not metres > 0:
+        raise RunError(f"--known-distance must be six finite numbers and a positive distance, got {distance}")
     units = float(np.linalg.norm(ends[1] - ends[0]))
     if not units > _ON_LINE * max(1.0, float(np.abs(ends).max())):
         raise RunError("--known-distance must have two different points")
-    facts = {"up": up_source, "points": ends.tolist(), "metres": metres, "units": units}
+    details = {"up": up_source, "points": ends.tolist(), "metres": metres, "units": units}
     doubts = () if up_source != "the run's z" else ("the cameras do not determine up: using z of the run",)
-    zeros = np.zeros(3)
-    return Georeference(metres / units, rotation_to_z(up), zeros, zeros, "a known distance", facts=facts, doubts=doubts)
+    place = (metres / units, rotation_to_z(up), np.zeros(3), np.zeros(3))
+    return Georeference(*place, "a known distance", details=details, doubts=doubts)
 
 
 def _of_markers(
@@ -149,11 +149,11 @@ def _of_markers(
     if not (math.isfinite(metres) and metres > 0):
         raise RunError(f"--markers must be the side length of a marker in metres, a positive number, got {metres}")
     aruco = detector(dictionary)
-    seen = [(view, detected(aruco, view)) for view in counted(views, "detecting markers", len(views), on_event)]
-    markers, left = in_run(seen)
+    detections = [(view, detected(aruco, view)) for view in counted(views, "detecting markers", len(views), on_event)]
+    markers, rejected = in_run(detections)
     if not markers:
-        count = sum(len(found) for _, found in seen)
-        why = f"; {left[0]}" if left else ""
+        count = sum(len(corners) for _, corners in detections)
+        why = f"; {rejected[0]}" if rejected else ""
         raise DataError(
             f"no {dictionary} marker is usable: {count} detections in {len(views)} photographs{why}; check "
             "marker_dictionary, and that markers are at least 20 px wide in two photographs"
@@ -165,22 +165,22 @@ def _of_markers(
         Residual(f"marker {marker.number}", np.array([error, 0.0, 0.0]), FITTED)
         for marker, error in zip(markers, errors, strict=True)
     )
-    doubts = list(left)
+    doubts = list(rejected)
     if len(markers) > 1 and float(np.abs(errors).max()) > _SCALE_ERROR * metres:
         doubts.append(
             f"marker sides differ from {metres:g} m by up to {np.abs(errors).max() / metres:.1%}: are all equal?"
         )
-    facts = {"up": up_source, "side": metres, "markers": [_marker_facts(marker) for marker in markers]}
+    details = {"up": up_source, "side": metres, "markers": [_marker_details(marker) for marker in markers]}
     zeros = np.zeros(3)
     return Georeference(
         *(scale, rotation_to_z(up), zeros, zeros, f"{len(markers)} printed markers"),
         residuals=residuals,
-        facts=facts,
+        details=details,
         doubts=tuple(doubts),
     )
 
 
-def _marker_facts(marker: Marker) -> dict[str, Any]:
+def _marker_details(marker: Marker) -> dict[str, Any]:
     return {"number": marker.number, "photographs": marker.photographs, "corners": marker.corners.tolist()}
 
 
@@ -188,17 +188,17 @@ def _marker_facts(marker: Marker) -> dict[str, Any]:
 def _positions(views: Sequence[View], options: GeoreferenceOptions, on_event: OnEvent) -> Positions:
     if options.positions is not None:
         return read_positions(options.positions)
-    found = {}
+    places = {}
     for view in counted(views, "reading EXIF", len(views), on_event):
         place = None if view.path is None else read_metadata(view.path).place
         if place is not None:
-            found[view.name] = np.array(place)
-    if not found:
+            places[view.name] = np.array(place)
+    if not places:
         raise DataError(
             f"none of {len(views)} photographs has a position in its EXIF; use a file of positions (--positions) or a "
             "known distance (--known-distance)"
         )
-    return Positions(found, None, "GPS in the photographs' EXIF", in_degrees=True)
+    return Positions(places, None, "GPS in the photographs' EXIF", in_degrees=True)
 
 
 def _of_positions(
@@ -236,9 +236,9 @@ def _required_epsg(options: GeoreferenceOptions, source: str) -> int:
 def _doubts_of_fit(fit: Fit, target: np.ndarray, cameras: Sequence[Camera]) -> list[str]:
     """Return warnings about a fit to camera positions."""
     doubts = []
-    left = int((~fit.inliers).sum())
-    if left > _LEFT * len(fit.inliers):
-        doubts.append(f"{left} of {len(fit.inliers)} positions are outliers and were left out")
+    outliers = int((~fit.inliers).sum())
+    if outliers > _MAX_OUTLIERS * len(fit.inliers):
+        doubts.append(f"{outliers} of {len(fit.inliers)} positions are outliers and were left out")
     rms = float(np.sqrt(np.mean(np.square(fit.residuals[fit.inliers]).sum(axis=1))))
     spread = float(np.sqrt(np.nansum(np.nanvar(target[fit.inliers], axis=0))))
     if rms > _NOISY * spread:
@@ -251,7 +251,7 @@ def _doubts_of_fit(fit: Fit, target: np.ndarray, cameras: Sequence[Camera]) -> l
     if fit.tilt == "places" and up is not None:
         angle = math.degrees(math.acos(float(np.clip(fit.rotation[2] @ up / np.linalg.norm(up), -1, 1))))
         if angle > _TILTED:
-            doubts.append(f"up from the positions differs by {angle:.0f} degrees from how the cameras were held")
+            doubts.append(f"up from the positions differs by {angle:.0f} degrees from up of the cameras")
     return doubts
 
 
@@ -273,8 +273,8 @@ def _of_control(views: Sequence[View], options: GeoreferenceOptions, up: np.ndar
     doubts = [*located.doubts, *_doubts_of_control(fit, located)]
     source = f"{int(fitted.sum())} control points in {options.control.name}"
     pixels = {name: px for name, px in zip(located.names, located.pixels.tolist(), strict=True) if math.isfinite(px)}
-    found = _georeference(fit, frame, located.names, located.check, source, doubts)
-    return replace(found, facts={**found.facts, "pixels": pixels})
+    georeference = _georeference(fit, frame, located.names, located.check, source, doubts)
+    return replace(georeference, details={**georeference.details, "pixels": pixels})
 
 
 def fit_control(located: Located, target: np.ndarray, up: np.ndarray | None, tilt: str) -> Fit:
@@ -316,13 +316,13 @@ def _georeference(
     residuals = tuple(
         Residual(name, error, role) for name, error, role in zip(names, fit.residuals, roles, strict=True)
     )
-    facts: dict[str, Any] = {"up": fit.tilt}
+    details: dict[str, Any] = {"up": fit.tilt}
     if math.isfinite(fit.scale_error):
-        facts["scale_error"] = fit.scale_error
+        details["scale_error"] = fit.scale_error
     if math.isfinite(fit.tilt_error):
-        facts["tilt_error_degrees"] = fit.tilt_error
+        details["tilt_error_degrees"] = fit.tilt_error
     return Georeference(
         *(fit.scale, fit.rotation, fit.T[:3, 3], frame.origin, source),
         *(frame.epsg, frame.geodetic, frame.grid_scale, residuals, tuple(doubts)),
-        facts=facts,
+        details=details,
     )

@@ -1,8 +1,8 @@
 """Robust fit of the similarity between a run and the world from corresponding positions.
 
 A similarity of seven parameters needs three positions that are not on a line. Its tilt depends on the accuracy and
-spread of the positions: a phone's GPS over ten metres gives errors of ten degrees, while cameras are held level to a
-degree. If the cameras are more accurate, up is taken from them, and only heading, scale and translation are fitted.
+spread of the positions: a phone's GPS over ten metres gives errors of ten degrees, while cameras are level to about a
+degree. If the cameras are more accurate, they determine up, and only heading, scale and translation are fitted.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Fit:
 
 
 def cameras_up(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return the up direction [3] of a run from how its cameras were held, rounded to an axis if it is close.
+    """Return the up direction [3] of a run from the orientation of its cameras, rounded to an axis if it is close.
 
     None if the cameras do not agree.
     """
@@ -160,16 +160,16 @@ def _solve_level(source: np.ndarray, target: np.ndarray) -> np.ndarray | None:
     """Fit scale, heading and translation [4, 4] of a source with z up; unknown heights are ignored."""
     if len(source) < 2:
         return None
-    known = np.isfinite(target[:, 2])
+    has_height = np.isfinite(target[:, 2])
     mean_s, mean_t = source[:, :2].mean(axis=0), target[:, :2].mean(axis=0)
     s, t = source[:, :2] - mean_s, target[:, :2] - mean_t
     turn = complex(np.vdot(s[:, 0] + 1j * s[:, 1], t[:, 0] + 1j * t[:, 1]))
     squares, product = float(np.square(s).sum()), abs(turn)
     up_s = up_t = 0.0
-    if known.any():
-        up_s, up_t = float(source[known, 2].mean()), float(target[known, 2].mean())
-        squares += float(np.square(source[known, 2] - up_s).sum())
-        product += float(((source[known, 2] - up_s) * (target[known, 2] - up_t)).sum())
+    if has_height.any():
+        up_s, up_t = float(source[has_height, 2].mean()), float(target[has_height, 2].mean())
+        squares += float(np.square(source[has_height, 2] - up_s).sum())
+        product += float(((source[has_height, 2] - up_s) * (target[has_height, 2] - up_t)).sum())
     if not (abs(turn) > 1e-12 * max(squares, 1e-300) and product > 0):
         return None
     scale, cos, sin = product / squares, turn.real / abs(turn), turn.imag / abs(turn)

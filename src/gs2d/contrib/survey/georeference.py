@@ -27,7 +27,7 @@ Role = Literal["fitted", "left out", "check"]
 FITTED: Role = "fitted"
 LEFT_OUT: Role = "left out"
 CHECK: Role = "check"
-_UP = {"places": "the positions", "cameras": "how the cameras were held", "given": "--set up"}
+_UP = {"places": "the positions", "cameras": "the orientation of the cameras", "given": "--set up"}
 _ROLES: tuple[Role, ...] = (FITTED, LEFT_OUT, CHECK)
 
 
@@ -54,14 +54,14 @@ class Georeference:
     translation: np.ndarray  # [3] metres; small, because ``origin`` has the large part
     # [3] float64 of local coordinates in the frame: east, north, height; zeros without a geographic frame
     origin: np.ndarray
-    method: str  # source of the georeference, in words
+    method: str  # source of the georeference, as text
     epsg: int | None = None  # projected coordinate system, if any
     geodetic: np.ndarray | None = None  # [3] latitude, longitude (degrees, WGS 84) and height (m) of the origin
     # metres of the frame per metre on the ground, horizontally: 0.9996 to 1.0004 in UTM, else 1
     grid_scale: float = 1.0
     residuals: tuple[Residual, ...] = ()
     doubts: tuple[str, ...] = ()  # warnings, one sentence each
-    facts: Mapping[str, Any] = field(default_factory=dict)  # further results of the method, as JSON values
+    details: Mapping[str, Any] = field(default_factory=dict)  # further results of the method, as JSON values
 
     @property
     def metres_per_unit(self) -> float:
@@ -99,13 +99,13 @@ class Georeference:
 
     def lines(self) -> list[str]:
         """Return a summary, as lines."""
-        error = self.facts.get("scale_error")
+        error = self.details.get("scale_error")
         accuracy = f" (+- {error:.2%})" if isinstance(error, float) else ""
         lines = [f"georeference: {self.frame}, from {self.method}", f"scale: {self.scale:.6g} m per unit{accuracy}"]
         if self.grid_scale != 1:
             lines[-1] += f"; 1 m on the ground is {self.grid_scale:.5f} m of the map"
-        if "up" in self.facts:
-            lines.append(f"up: from {_UP.get(self.facts['up'], self.facts['up'])}")
+        if "up" in self.details:
+            lines.append(f"up: from {_UP.get(self.details['up'], self.details['up'])}")
         if np.any(self.origin):
             lines.append("offset: " + " ".join(f"{value:.10g}" for value in self.origin))
         if self.geodetic is not None:
@@ -117,8 +117,8 @@ class Georeference:
             if rms is not None and worst is not None:
                 count = self.count(role)
                 lines.append(f"{title}: {rms:.4g} m rms of {count}, worst {worst.distance:.4g} m ({worst.name})")
-        if left := self.count("left out"):
-            lines.append(f"outliers left out: {left}")
+        if outliers := self.count("left out"):
+            lines.append(f"outliers left out: {outliers}")
         return [*lines, *(f"doubtful: {doubt}" for doubt in self.doubts)]
 
     def to_json(self) -> dict[str, Any]:
@@ -138,7 +138,7 @@ class Georeference:
             "method": self.method,
             "rms": {role: self.rms(role) for role in _ROLES if self.count(role)},
             "doubts": list(self.doubts),
-            "facts": dict(self.facts),
+            "facts": dict(self.details),
             "residuals": [
                 {"name": residual.name, "role": residual.role, "error": residual.error.tolist()}
                 for residual in self.residuals
@@ -159,14 +159,14 @@ class Georeference:
             epsg = data.get("epsg")
             residuals = tuple(map(_residual, data.get("residuals", ())))
             doubts = tuple(map(str, data.get("doubts", ())))
-            facts = dict(data.get("facts", {}))
+            details = dict(data.get("facts", {}))
             method = str(data["method"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DataError(
                 f"a georeference must hold scale, rotation, translation, origin and method, got {error!r}"
             ) from error
         _check(scale, grid_scale, rotation, (translation, origin, *([] if geodetic is None else [geodetic])), epsg)
-        return cls(scale, rotation, translation, origin, method, epsg, geodetic, grid_scale, residuals, doubts, facts)
+        return cls(scale, rotation, translation, origin, method, epsg, geodetic, grid_scale, residuals, doubts, details)
 
 
 def read_georeference(run: Path) -> Georeference | None:

@@ -50,14 +50,14 @@ def detector(dictionary: str) -> Any:
         raise DataError(f"marker_dictionary must be one of {', '.join(DICTIONARIES)}, got {dictionary}")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[dictionary]))
-    return cv2.aruco.ArucoDetector(known, parameters)
+    predefined = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[dictionary]))
+    return cv2.aruco.ArucoDetector(predefined, parameters)
 
 
 def detected(aruco: Any, view: View) -> dict[int, np.ndarray]:
     """Detect markers in a photograph: corners [4, 2] px, by number.
 
-    Numbers that occur more than once are left out.
+    Numbers that occur more than once are ignored.
     """
     if view.path is None:
         return {}
@@ -74,30 +74,30 @@ def detected(aruco: Any, view: View) -> dict[int, np.ndarray]:
     }
 
 
-def in_run(seen: Iterable[tuple[View, dict[int, np.ndarray]]]) -> tuple[list[Marker], list[str]]:
-    """Locate the markers that at least two photographs show; returns them and a sentence per rejected marker."""
+def in_run(detections: Iterable[tuple[View, dict[int, np.ndarray]]]) -> tuple[list[Marker], list[str]]:
+    """Locate the markers that are visible in two photographs; return them and a reason for each rejected one."""
     by_number: dict[int, list[tuple[View, np.ndarray]]] = {}
-    for view, markers in seen:
+    for view, markers in detections:
         for number, corners in markers.items():
             by_number.setdefault(number, []).append((view, corners))
-    kept: list[Marker] = []
-    left: list[str] = []
+    located: list[Marker] = []
+    rejected: list[str] = []
     for number, marks in sorted(by_number.items()):
         if len(marks) < 2:
-            left.append(f"marker {number} is in one photograph only")
+            rejected.append(f"marker {number} is in one photograph only")
             continue
         try:
             corners, worst = _corners(number, marks)
         except DataError as error:
-            left.append(str(error))
+            rejected.append(str(error))
             continue
         sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
         bend = float(np.linalg.norm(corners[0] - corners[1] + corners[2] - corners[3]))
         if worst > MAX_PIXELS or bend > MAX_PLANARITY * sides.mean():
-            left.append(f"marker {number} moved between photographs, or exists twice (error {worst:.1f} px)")
+            rejected.append(f"marker {number} moved between photographs, or exists twice (error {worst:.1f} px)")
             continue
-        kept.append(Marker(number, corners, float(sides.mean()), len(marks)))
-    return kept, left
+        located.append(Marker(number, corners, float(sides.mean()), len(marks)))
+    return located, rejected
 
 
 def _corners(number: int, marks: Sequence[tuple[View, np.ndarray]]) -> tuple[np.ndarray, float]:

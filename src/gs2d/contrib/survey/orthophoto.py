@@ -52,8 +52,8 @@ def orthophoto_run(
 ) -> dict[str, Any]:
     """Write orthophoto and elevation model of a georeferenced run; returns files and counts.
 
-    A cell shows the highest surface of the mesh, in the colours of the photographs that see it best, else those of the
-    mesh.
+    A cell shows the highest surface of the mesh, in the colours of the photographs with the best view of it, else those
+    of the mesh.
     """
     required("geo", "tifffile", "a GeoTIFF")  # fail early
     path = Path(path)
@@ -97,10 +97,10 @@ def _pixel(job: Trained, mesh: Mesh) -> float:
         pixels, depth = camera.project(some)
         shown = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
         size = np.where(shown, np.minimum(size, depth / camera.fx), size)
-    known = np.isfinite(size)
-    if not known.any():
+    visible = np.isfinite(size)
+    if not visible.any():
         raise RunError("no photograph shows the mesh; does it belong to this capture?")
-    return float(np.median(size[known]))
+    return float(np.median(size[visible]))
 
 
 def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster:
@@ -125,7 +125,7 @@ def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster
 
 
 def from_above(vertices: np.ndarray, faces: np.ndarray, raster: Raster) -> Hits:
-    """Cast a ray straight down through every cell, and keep the highest triangle of each; ``depth`` has no meaning.
+    """Cast a vertical ray through every cell, and return the highest triangle of each; ``depth`` has no meaning.
 
     The map (x, y, 1) / q, with q linear in the height, keeps planes flat and makes vertical lines the rays of a camera
     whose pixels are the cells; higher points are nearer.
@@ -143,7 +143,7 @@ def from_above(vertices: np.ndarray, faces: np.ndarray, raster: Raster) -> Hits:
 
 
 def _colors(job: Trained, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[np.ndarray, int]:
-    """Return colours [H, W, 4] uint8, alpha 0 without surface, and the number of cells that no photograph sees."""
+    """Return colours [H, W, 4] uint8, alpha 0 without surface, and the number of cells not visible in photographs."""
     height, width = hits.face.shape
     index = np.flatnonzero(hits.face.reshape(-1) >= 0)
     texels = Texels(
@@ -153,13 +153,13 @@ def _colors(job: Trained, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[np
         np.ascontiguousarray(hits.weights.reshape(-1, 3)[index, :2]),
     )
     images = partial(photographs, job, job.scene.train, on_event)
-    found, seen = surface_colors(mesh, texels, images, threads=torch.get_num_threads())
-    if mesh.colors is not None and not seen.all():
-        found[~seen] = np.rint(texels.interpolated(mesh.colors, mesh.faces))[~seen].astype(np.uint8)
+    colors, visible = surface_colors(mesh, texels, images, threads=torch.get_num_threads())
+    if mesh.colors is not None and not visible.all():
+        colors[~visible] = np.rint(texels.interpolated(mesh.colors, mesh.faces))[~visible].astype(np.uint8)
     image = np.zeros((height * width, 4), dtype=np.uint8)
-    image[index, :3] = found
+    image[index, :3] = colors
     image[index, 3] = 255
-    return image.reshape(height, width, 4), int((~seen).sum())
+    return image.reshape(height, width, 4), int((~visible).sum())
 
 
 def _elevations(local: np.ndarray, mesh: Mesh, hits: Hits, place: Georeference) -> np.ndarray:

@@ -17,17 +17,17 @@ _COLUMNS = ["Name", "Used as", "Error, m", "East", "North", "Up"]
 @register_section("georeference", title="World coordinates")
 def georeference_section(run: RunRecord) -> str | None:
     """Return the georeference and its largest residuals; None if the run has none."""
-    found = read_georeference(run.path)
-    if found is None:
+    world = read_georeference(run.path)
+    if world is None:
         return None
-    first, *lines = found.lines()
+    first, *lines = world.lines()
     html = Markup("<p>{}.</p><ul>{}</ul>").format(
         first[:1].upper() + first[1:], Markup().join(Markup("<li>{}</li>").format(line) for line in lines)
     )
-    shown = sorted(found.residuals, key=lambda residual: (_ORDER.index(residual.role), -residual.distance))[:SHOWN]
+    shown = sorted(world.residuals, key=lambda residual: (_ORDER.index(residual.role), -residual.distance))[:SHOWN]
     if shown:
         html += macro("macros.html", "table", _COLUMNS, [_row(residual) for residual in shown], texts=(0, 1))
-    if rest := len(found.residuals) - len(shown):
+    if rest := len(world.residuals) - len(shown):
         html += Markup("<p>{} more have smaller errors.</p>").format(rest)
     return html
 

@@ -1,4 +1,4 @@
-"""What ``gs2d survey`` does and prints."""
+"""The action of ``gs2d survey``."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from gs2d.pipeline.finish.run_report import show_again
 
 
 def survey(command: SurveyCommand, console: Console) -> None:
-    """Run ``gs2d survey``; a run that changes gets its report and its page again."""
+    """Run ``gs2d survey``; write report and page again if the georeference of the run changes."""
     if command.resolution is not None and not command.orthophoto:
-        raise RunError("--set resolution belongs to --orthophoto, which was not given")
+        raise RunError("--set resolution needs --orthophoto")
     georeference = georeference_run(command.run, command, console.on_event)
     if command.remove or any(getattr(command, source) not in (None, False) for source in SOURCES):
         show_again(open_run(command.run), console.on_event)
@@ -27,7 +27,7 @@ def survey(command: SurveyCommand, console: Console) -> None:
         result["orthophoto"] = orthophoto_run(*options, threads=command.threads)
     elif command.out is not None:
         result["export"] = export_world(command.run, command.out, command.part)
-    none = "no georeference; --gps, --positions, --control, --known-distance or --markers finds one"
+    none = "no georeference; use --gps, --positions, --control, --known-distance or --markers"
     for line in [none] if georeference is None else georeference.lines():
         console.say(line)
     if "export" in result:

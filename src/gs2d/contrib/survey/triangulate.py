@@ -13,7 +13,7 @@ from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 _STEPS = 10  # Gauss-Newton iterations
-_NEWTON = 20  # of Newton, at most
+_NEWTON = 20  # Newton iterations
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,8 @@ class Triangulated:
 def triangulate(views: Sequence[View], marks: np.ndarray, name: str) -> Triangulated:
     """Return the point with the least reprojection error of its marks.
 
-    ``marks`` [M, 2] are px in the image files, from the upper left corner. ``name`` is that of the point in errors:
-    DataError if there are fewer than two views, the rays are nearly parallel, or the point is behind a camera.
+    ``marks`` [M, 2] are px in the image files, from the upper left corner. Raises DataError with the ``name`` of the
+    point if there are fewer than two views, the rays are nearly parallel, or the point is behind a camera.
     """
     if len(views) < 2:
         raise DataError(f"{name} must be marked in at least two photographs, got {len(views)}")
@@ -39,17 +39,17 @@ def triangulate(views: Sequence[View], marks: np.ndarray, name: str) -> Triangul
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # projection onto the plane perpendicular to each ray
     if np.linalg.eigvalsh(across.sum(axis=0))[0] < math.sin(math.radians(0.5)) ** 2 / 2:
-        raise DataError(f"{name} must be seen from different directions, got rays less than a degree apart")
+        raise DataError(f"{name} must be visible from different directions, got rays less than a degree apart")
     point = np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, centers))
     point = _nearest_images(point, ideal, rotations, centers)
     local = np.einsum("vij,vj->vi", rotations, point - centers)
     if not (local[:, 2] > 0).all():
         behind = views[int(local[:, 2].argmin())].name
         raise DataError(f"{name} must be in front of its cameras, but is behind that of {behind}")
-    seen = np.stack(
+    projected = np.stack(
         [view.file_intrinsics().project(p[None, :2] / p[2])[0] for view, p in zip(views, local, strict=True)]
     )
-    return Triangulated(point, np.linalg.norm(seen - marks, axis=1))
+    return Triangulated(point, np.linalg.norm(projected - marks, axis=1))
 
 
 def _ideal(k: Intrinsics, pixel: np.ndarray) -> np.ndarray:
