@@ -165,10 +165,10 @@ def seed(run):
 
 
 @gs2d.register_splat_reader("example-xyz", endings=(".xyz",))
-def read_xyz(path, tell):
+def read_xyz(path, warn):
     """Read centres from text, as grey disks of one size."""
     means = np.loadtxt(path, dtype=np.float32, ndmin=2)
-    tell("only the centres were read")
+    warn("only the centres were read")
     count, ones = len(means), np.ones((len(means), 1), np.float32)
     flat, quats = ones * [-4.0, -4.0, -40.0], ones * [1.0, 0.0, 0.0, 0.0]
     empty = np.zeros((count, 0, 3), np.float32)

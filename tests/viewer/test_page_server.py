@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from gs2d.errors import BackendError, DataError
-from gs2d.viewer.page_server import HOST, Answer, PageServer, free_port
+from gs2d.viewer.page_server import HOST, PageServer, Response, free_port
 
 
-def page(_: Mapping[str, str]) -> Answer:
-    return Answer("text/html", [b"<!doctype html>", memoryview(np.arange(3, dtype=np.uint8))], {"X-More": "yes"})
+def page(_: Mapping[str, str]) -> Response:
+    return Response("text/html", [b"<!doctype html>", memoryview(np.arange(3, dtype=np.uint8))], {"X-More": "yes"})
 
 
-def refuse(_: Mapping[str, str]) -> Answer:
+def refuse(_: Mapping[str, str]) -> Response:
     raise DataError("there is no such stage")
 
 
-def fail(_: Mapping[str, str]) -> Answer:
+def fail(_: Mapping[str, str]) -> Response:
     raise ValueError("a defect")
 
 

@@ -29,7 +29,7 @@ from gs2d.viewer.scene_page import (
     PageView,
     pack_for,
     served_page,
-    splats_answer,
+    splats_response,
     write_page,
 )
 
@@ -98,7 +98,7 @@ def at_origin(camera: Camera) -> Camera:
 def test_stored_splats_render_like_the_originals(degree: int, least: float) -> None:
     splats, settings = some_splats(), replace(SETTINGS, sh_degree=degree)
     packed = pack_splats(splats, ORIGIN, degree, settings.alpha_min)
-    assert (packed.degree, packed.facts["texels"]) == (degree, sh_texels(degree))
+    assert (packed.degree, packed.metadata["texels"]) == (degree, sh_texels(degree))
     stored = unpacked(data_of(packed), packed.count, degree, packed.scales)
     with torch.no_grad():
         before = rasterize(splats, CAMERA, settings, backend="reference")
@@ -202,7 +202,7 @@ def test_a_served_page_has_no_data_and_connects_to_its_own_server_only(tmp_path:
     assert page.loads == ["data:,"]
     assert set(page.texts) == set(alone.texts) - {"mesh", "photographs", "splats"}
     packed = pack_for(SCENE, some_splats())
-    answer = splats_answer(packed)
+    answer = splats_response(packed)
     assert b"".join(answer.parts) == data_of(packed)
     facts = {**json.loads(page.texts["facts"]), **json.loads(answer.headers["X-Splats"]), "offer": None}
     assert facts == {**json.loads(alone.texts["facts"]), "offer": None}

@@ -24,8 +24,8 @@ from gs2d.errors import DataError
 from gs2d.meshing.web_mesh import web_mesh
 from gs2d.render.types import RasterSettings
 from gs2d.viewer.packed_splats import pack_splats
-from gs2d.viewer.page_server import Answer, PageServer
-from gs2d.viewer.scene_page import PageOffer, PageScene, PageView, served_page, splats_answer
+from gs2d.viewer.page_server import PageServer, Response
+from gs2d.viewer.scene_page import PageOffer, PageScene, PageView, served_page, splats_response
 
 ORIGIN, UP = np.array([10.0, -20.0, 5.0]), np.array([0.0, 0.0, 1.0])
 SETTINGS = RasterSettings(near=0.05, background=(1.0, 1.0, 1.0), sh_degree=0)
@@ -66,10 +66,10 @@ class Training:
         self.server = PageServer(
             None,
             {
-                "": lambda _: Answer("text/html; charset=utf-8", [page]),
-                "state": lambda _: Answer("application/json", [json.dumps(self.state).encode()]),
+                "": lambda _: Response("text/html; charset=utf-8", [page]),
+                "state": lambda _: Response("application/json", [json.dumps(self.state).encode()]),
                 "splats": self.splats,
-                "mesh": lambda _: Answer("application/octet-stream", [square()]),
+                "mesh": lambda _: Response("application/octet-stream", [square()]),
                 "photograph": self.photograph,
             },
         )
@@ -78,16 +78,16 @@ class Training:
     def state(self) -> dict[str, object]:
         return {"version": self.version, "status": self.status}
 
-    def splats(self, arguments: Mapping[str, str]) -> Answer:
+    def splats(self, arguments: Mapping[str, str]) -> Response:
         stage = arguments.get("stage") or ["", "red", "blue"][self.version]
         if stage not in COLORS:
             raise DataError(f"{stage} cannot be read")
-        return splats_answer(pack_splats(disc(stage), ORIGIN, 0, SETTINGS.alpha_min))
+        return splats_response(pack_splats(disc(stage), ORIGIN, 0, SETTINGS.alpha_min))
 
-    def photograph(self, arguments: Mapping[str, str]) -> Answer:
+    def photograph(self, arguments: Mapping[str, str]) -> Response:
         file = io.BytesIO()
         Image.new("RGB", (8 * (1 + int(arguments["view"])), 8)).save(file, "JPEG")
-        return Answer("image/jpeg", [file.getvalue()])
+        return Response("image/jpeg", [file.getvalue()])
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import transform_splats
 from gs2d.errors import DataError
 
-Tell = Callable[[str], object]
+Warn = Callable[[str], object]
 """Receives a message about content that a reader dropped or changed."""
 FLAT_LOG_SCALE = math.log(1e-6)  # world units; largest thickness of a disk in files with three scales
 NO_SCALE = -80.0  # log scale that represents a scale of 0
@@ -108,7 +108,7 @@ class Gaussians:
 
     @property
     def is_flat(self) -> bool:
-        """Whether nearly all are disks with their normals along the third axis."""
+        """Return whether nearly all are disks with their normals along the third axis."""
         thickest = self.log_scales[:, 2] - self.log_scales[:, :2].max(axis=1, initial=-np.inf)
         return bool((thickest <= math.log(THIN)).mean() >= _FLAT) if len(self) else True
 
@@ -164,12 +164,12 @@ def with_thickness(log_scales: np.ndarray) -> np.ndarray:
     return np.concatenate([log_scales, thickness], axis=1).astype(np.float32)
 
 
-def drawn_bands(path: str | os.PathLike[str], shN: np.ndarray, tell: Tell) -> np.ndarray:
-    """Drop SH bands above degree 3 of coefficients [N, K-1, ...]; ``tell`` receives a message about it."""
+def drawn_bands(path: str | os.PathLike[str], shN: np.ndarray, warn: Warn) -> np.ndarray:
+    """Drop SH bands above degree 3 of coefficients [N, K-1, ...]; ``warn`` receives a message about it."""
     if shN.shape[1] < num_coefficients(MAX_DEGREE):
         return shN
     degree = math.isqrt(1 + shN.shape[1]) - 1
-    tell(f"{Path(path).name}: SH degree {degree} was reduced to {MAX_DEGREE}, the highest supported")
+    warn(f"{Path(path).name}: SH degree {degree} was reduced to {MAX_DEGREE}, the highest supported")
     return shN[:, : num_coefficients(MAX_DEGREE) - 1]
 
 

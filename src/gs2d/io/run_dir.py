@@ -11,7 +11,7 @@
       poses.json  learned.json  learned properties of images and cameras
       edits/         0001.ply ...: the splats before each edit (`gs2d edit`)
       subject.json   the subject that the cameras look at (data.subject_box)
-      georeference.json  position of the run in the world, if known
+      georeference.json  position of the run in the world, if it was surveyed
       .lock          held by the process that trains; the operating system releases it when that process ends
 
 Every file is written to a temporary name and renamed, except the log, which is appended to: each checkpoint stores the
@@ -55,7 +55,7 @@ SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "re
 POSES, LEARNED, SUBJECT, VERDICT = "poses.json", "learned.json", "subject.json", "verdict.json"
 GEOREFERENCE = "georeference.json"
 FORMAT = 2
-KEPT_CHECKPOINTS = 2
+MAX_CHECKPOINTS = 2
 _UNREADABLE = (
     *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
@@ -99,8 +99,8 @@ class EventLog:
             return
         try:
             with open(self.path, "r+b") as file:
-                kept = file.read(size)
-                file.truncate(kept.rfind(b"\n") + 1)
+                data = file.read(size)
+                file.truncate(data.rfind(b"\n") + 1)
         except OSError as error:
             raise disk_error(self.path, error) from error
 
@@ -159,13 +159,13 @@ class CheckpointFile:
 class RunFolder:
     """One run on disk. :func:`claim_run` creates or continues one, :func:`open_run` opens an existing one."""
 
-    def __init__(self, path: Path, made: tuple[Path, ...] = ()) -> None:
+    def __init__(self, path: Path, created: tuple[Path, ...] = ()) -> None:
         self.path = path
-        self.made = made  # folders that were created for it
+        self.created = created  # folders that were created for it
         self.events = EventLog(path / EVENTS)
 
     def file(self, name: str) -> Path:
-        """Path of a file of the run."""
+        """Return the path of a file of the run."""
         return self.path / name
 
     # -- definition and results ----------------------------------------------------------------------------------------
@@ -184,8 +184,8 @@ class RunFolder:
         except RecursionError as error:
             raise RunError(f"{self.file(RUN_JSON)} is nested too deeply and must be damaged; restore it") from error
         if data.get("format") != FORMAT:
-            made = data.get("versions")
-            writer = f"gs2d {made['2dgs-r']}" if isinstance(made, dict) and "2dgs-r" in made else "another version"
+            tools = data.get("versions")
+            writer = f"gs2d {tools['2dgs-r']}" if isinstance(tools, dict) and "2dgs-r" in tools else "another version"
             raise RunError(
                 f"{self.file(RUN_JSON)} has format {str(data.get('format'))[:40]}, expected {FORMAT}; use "
                 f"{writer[:40]}, which wrote it, or train again with --overwrite"
@@ -212,13 +212,13 @@ class RunFolder:
     # -- checkpoints ---------------------------------------------------------------------------------------------------
     def checkpoints(self) -> list[CheckpointFile]:
         """Return all checkpoints, oldest first."""
-        found = []
+        checkpoints = []
         for path in self.file(CHECKPOINTS).glob("*.pt"):
             match = _CHECKPOINT_NAME.fullmatch(path.name)
             if match:
                 iteration = None if match[3] == "end" else int(match[3])
-                found.append(CheckpointFile(path, int(match[1]), match[2], iteration))
-        return sorted(found, key=lambda checkpoint: checkpoint.progress)
+                checkpoints.append(CheckpointFile(path, int(match[1]), match[2], iteration))
+        return sorted(checkpoints, key=lambda checkpoint: checkpoint.progress)
 
     def save_checkpoint(self, stage_index: int, stage: str, iteration: int | None, payload: dict[str, Any]) -> Path:
         """Write a checkpoint (``iteration=None``: the end of the stage) and remove older ones.
@@ -232,7 +232,7 @@ class RunFolder:
         self.events.sync()
         save_tensors(path, {**payload, "events_bytes": self.events.size})
         within = [c for c in self.checkpoints() if c.iteration is not None]
-        for checkpoint in within if iteration is None else within[:-KEPT_CHECKPOINTS]:
+        for checkpoint in within if iteration is None else within[:-MAX_CHECKPOINTS]:
             checkpoint.path.unlink(missing_ok=True)
         return path
 
@@ -256,7 +256,7 @@ class RunFolder:
             file.close()
 
     def sweep(self) -> None:
-        """Remove what killed processes left: temporary files, and checkpoints within stages that have ended."""
+        """Remove files of killed processes: temporary files, and checkpoints within stages that have ended."""
         renders = (Path(folder) for folder, _, _ in os.walk(self.file(RENDERS)))
         for folder in (self.path, *map(self.file, (CHECKPOINTS, SURFACE, EDITS)), *renders):
             sweep(folder)
@@ -278,11 +278,11 @@ class RunFolder:
         """Remove a run that failed early: its files, and the folders that were created for it."""
         self.clear()
         self.file(LOCK).unlink(missing_ok=True)
-        remove_made(self.made)
+        remove_created(self.created)
 
 
 def _object(path: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object."""
+    """Read a JSON file that contains an object."""
     data = read_json(path)
     if not isinstance(data, dict):
         raise RunError(f"{path} must hold a JSON object, got {type(data).__name__}; restore it")
@@ -290,27 +290,27 @@ def _object(path: Path) -> dict[str, Any]:
 
 
 def is_run(path: Path) -> bool:
-    """Whether a folder holds a run."""
+    """Return whether a folder contains a run."""
     return (path / RUN_JSON).is_file()
 
 
 def open_run(path: str | Path) -> RunFolder:
     """Open an existing run.
 
-    Raises RunError if the folder does not exist or holds no run.
+    Raises RunError if the folder does not exist or contains no run.
     """
     path = Path(path)
     if not is_run(path):
-        got = "a folder without run.json" if path.is_dir() else "a file" if path.exists() else "nothing"
+        actual = "a folder without run.json" if path.is_dir() else "a file" if path.exists() else "nothing"
         remedy = suggestion(path, "run") if path.exists() else path_hint(path)
-        raise RunError(f"expected a run folder at {path}, got {got}{remedy}")
+        raise RunError(f"expected a run folder at {path}, got {actual}{remedy}")
     return RunFolder(path)
 
 
 def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple[str, ...] = ()) -> None:
     """Check early that :func:`claim_run` will succeed; writes nothing.
 
-    Raises RunError if ``path`` is a file, holds a run (without ``resume`` or ``overwrite``), or holds other files.
+    Raises RunError if ``path`` is a file, contains a run (without ``resume`` or ``overwrite``), or other files.
     """
     path = Path(path)
     if resume and overwrite:
@@ -344,8 +344,8 @@ def claim_run(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple
     """
     check_claim(path, resume=resume, overwrite=overwrite, allowed=allowed)
     path = Path(path)
-    made = make_folder(path)
-    run = RunFolder(path, made)
+    created = make_folder(path)
+    run = RunFolder(path, created)
     if overwrite:
         with run.locked():
             run.clear()
@@ -362,7 +362,7 @@ def make_folder(path: Path) -> tuple[Path, ...]:
     return tuple(missing)
 
 
-def remove_made(folders: tuple[Path, ...]) -> None:
+def remove_created(folders: tuple[Path, ...]) -> None:
     """Remove the folders that ``make_folder`` created, if they are empty."""
     for folder in folders:
         with contextlib.suppress(OSError):  # not empty
@@ -405,8 +405,8 @@ def load_tensors(path: Path) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions that the result depends on."""
-    found = {"python": platform.python_version(), "2dgs-r": __version__}
-    return found | {name: _installed_version(name) for name in ("torch", "numpy", "scipy", "pillow")}
+    own = {"python": platform.python_version(), "2dgs-r": __version__}
+    return own | {name: _installed_version(name) for name in ("torch", "numpy", "scipy", "pillow")}
 
 
 @functools.cache  # every checkpoint needs it, and reading the metadata takes 10 ms

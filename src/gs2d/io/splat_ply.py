@@ -17,10 +17,10 @@ import torch
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, with_thickness
+from gs2d.io.gaussians import Gaussians, Warn, drawn_bands, with_thickness
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 
-DISKS_COMMENT = "SplatRenderMode: 2dgs"  # says that splats with a third scale are disks: Brush, SplatTransform 3.2
+DISKS_COMMENT = "SplatRenderMode: 2dgs"  # marks splats with a third scale as disks: Brush, SplatTransform 3.2
 _ROT = ("rot_0", "rot_1", "rot_2", "rot_3")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _FIXED = ("x", "y", "z", *_DC, "opacity", "scale_0", "scale_1", *_ROT)
@@ -61,18 +61,18 @@ def _fill(rows: np.ndarray, names: list[str] | tuple[str, ...], columns: np.ndar
         rows[name] = columns[:, i]
 
 
-def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Splats:
+def read_splats(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> Splats:
     """Read splats in the official 2DGS layout, float32 on the CPU; extra properties are ignored.
 
-    Half floats stored as ``ushort`` are decoded. Colours ``red green blue`` may replace ``f_dc_*``. ``tell``: receives
+    Half floats stored as ``ushort`` are decoded. Colours ``red green blue`` may replace ``f_dc_*``. ``warn``: receives
     a message if SH bands above degree 3 are dropped. Raises DataError if the file is broken, no PLY, or of another
     kind: 3DGS (three scales), compressed, a mesh, points.
     """
     vertex = _splat_element(path, read_ply(path))
-    return Splats(**_attributes(path, vertex, ("scale_0", "scale_1"), tell))
+    return Splats(**_attributes(path, vertex, ("scale_0", "scale_1"), warn))
 
 
-def read_gaussians(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
+def read_gaussians(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> Gaussians:
     """Read 3DGS splats, with three scales; otherwise as ``read_splats``.
 
     Raises DataError if the file is broken, no PLY, or has fewer scales.
@@ -81,7 +81,7 @@ def read_gaussians(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> 
     if vertex is None:
         raise DataError(f"{path}: expected 3DGS splats, got a PLY without vertices; use a splat file")
     _check_complete(f"{path}: expected 3DGS splats", vertex, (*_FIXED, "scale_2"))
-    a = {name: t.numpy() for name, t in _attributes(path, vertex, ("scale_0", "scale_1", "scale_2"), tell).items()}
+    a = {name: t.numpy() for name, t in _attributes(path, vertex, ("scale_0", "scale_1", "scale_2"), warn).items()}
     return Gaussians(**{**a, "sh0": a["sh0"][:, 0]})
 
 
@@ -94,7 +94,7 @@ def _check_complete(expected: str, vertex: PlyElement, required: tuple[str, ...]
         )
 
 
-def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...], tell: Tell) -> dict[str, torch.Tensor]:
+def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...], warn: Warn) -> dict[str, torch.Tensor]:
     """Return the fields of ``Splats`` from the rows of an element."""
     names = {name for name, values in vertex.properties.items() if isinstance(values, np.ndarray)}
     n_rest = sum(name.startswith("f_rest_") for name in names)
@@ -120,7 +120,7 @@ def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...], tell:
         "log_scales": columns(*scales),
         "opacity_logits": columns("opacity")[:, 0],
         "sh0": (columns(*_DC) if colors is None else ((colors - 0.5) / C0).astype(np.float32))[:, None],
-        "shN": drawn_bands(str(path), columns(*rest).reshape(vertex.count, 3, per_channel).transpose(0, 2, 1), tell),
+        "shN": drawn_bands(str(path), columns(*rest).reshape(vertex.count, 3, per_channel).transpose(0, 2, 1), warn),
     }
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 

@@ -16,7 +16,7 @@ from gs2d.core.atomic_files import disk_error
 from gs2d.core.json_files import read_json
 from gs2d.data.masks import FOLDER as MASKS
 from gs2d.errors import DataError, DiskError, RunError
-from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_made
+from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_created
 from gs2d.sfm.search import SEARCH
 
 IMAGES, SPARSE, POSES_JSON, POSES_PNG = "images", "sparse", "poses.json", "poses.png"
@@ -92,7 +92,7 @@ def workspace(out: Path) -> Iterator[Path]:
         finally:
             if not (work / SEARCH).exists():
                 shutil.rmtree(work, ignore_errors=True)
-    remove_made(created)  # on systems where an open lock file cannot be deleted
+    remove_created(created)  # on systems where an open lock file cannot be deleted
 
 
 def sweep_workspace(out: Path) -> None:

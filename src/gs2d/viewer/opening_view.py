@@ -1,4 +1,4 @@
-"""Where the page of splats opens, and the directions from which the subject was photographed."""
+"""Compute the opening view of the page, and the directions from which the subject was photographed."""
 
 from __future__ import annotations
 

@@ -42,12 +42,12 @@ class PackedSplats:
 
     @property
     def data(self) -> list[memoryview]:
-        """The bytes of words and harmonics."""
+        """Return the bytes of words and harmonics."""
         return [array.reshape(-1).view(np.uint8).data for array in (self.words, self.harmonics)]
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """The values that a page needs to read the data."""
+    def metadata(self) -> dict[str, Any]:
+        """Return the values that a page needs to read the data."""
         return {"splats": self.count, "degree": self.degree, "texels": sh_texels(self.degree), "scales": self.scales}
 
     def zipped(self) -> Iterator[bytes]:
@@ -72,7 +72,7 @@ def pack_splats(
 
     Raise DataError if more than ``MAX_SPLATS`` are visible. ``origin`` [3] world units: means are stored relative to
     it, which preserves their precision in float32. ``degree``: highest SH degree to store. ``eyes`` [V, 3] world units:
-    camera centres. Splats that are wider than the cameras can have seen them, such as needles that point at the
+    camera centres. Splats that are too wide for the distance from the cameras, such as needles that point at the
     cameras, are marked as spikes.
     """
     splats = splats.to("cpu")

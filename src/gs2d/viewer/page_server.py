@@ -38,16 +38,16 @@ _HEADERS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """The answer to a request."""
+class Response:
+    """The response to a request."""
 
     kind: str  # content type
     parts: Sequence[bytes | memoryview]  # the body
     headers: Mapping[str, str] = field(default_factory=dict)  # further headers
 
 
-Route = Callable[[Mapping[str, str]], Answer]
-"""Answers a request with the arguments of its address. A Gs2dError becomes status 400 with its text."""
+Route = Callable[[Mapping[str, str]], Response]
+"""Responds to a request with the arguments of its address. A Gs2dError becomes status 400 with its text."""
 
 
 def free_port(port: int | None, *, option: str = "--port") -> int:
@@ -100,29 +100,29 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """Address of the page, with its token."""
+        """Return the address of the page, with its token."""
         return f"http://{HOST}:{self.port}/?token={self.token}"
 
-    def answer(self, address: str, hosts: Sequence[str]) -> tuple[HTTPStatus, Answer]:
-        """Answer a request for an address (path and query); ``hosts`` are its Host headers."""
+    def respond(self, address: str, hosts: Sequence[str]) -> tuple[HTTPStatus, Response]:
+        """Respond to a request for an address (path and query); ``hosts`` are its Host headers."""
         try:
             target = urlsplit(address)
             arguments = dict(parse_qsl(target.query, max_num_fields=20))
             is_local = len(hosts) == 1 and urlsplit(f"//{hosts[0]}").hostname in _LOCAL_NAMES
         except ValueError:
-            return HTTPStatus.BAD_REQUEST, Answer(TEXT, [b"The address cannot be read.\n"])
+            return HTTPStatus.BAD_REQUEST, Response(TEXT, [b"The address cannot be read.\n"])
         if not (is_local and hmac.compare_digest(arguments.get("token", "").encode(), self.token.encode())):
-            return HTTPStatus.FORBIDDEN, Answer(TEXT, [REFUSED.encode()])
+            return HTTPStatus.FORBIDDEN, Response(TEXT, [REFUSED.encode()])
         route = self._routes.get(target.path.removeprefix("/"))
         if route is None:
-            return HTTPStatus.NOT_FOUND, Answer(TEXT, [b"There is nothing at this address.\n"])
+            return HTTPStatus.NOT_FOUND, Response(TEXT, [b"There is nothing at this address.\n"])
         try:
             return HTTPStatus.OK, route(arguments)
         except Gs2dError as error:
-            return HTTPStatus.BAD_REQUEST, Answer(TEXT, [str(error).encode()])
+            return HTTPStatus.BAD_REQUEST, Response(TEXT, [str(error).encode()])
         except Exception as error:  # reported by the main thread
             self.failure = error
-            return HTTPStatus.INTERNAL_SERVER_ERROR, Answer(TEXT, [f"{type(error).__name__}: {error}".encode()])
+            return HTTPStatus.INTERNAL_SERVER_ERROR, Response(TEXT, [f"{type(error).__name__}: {error}".encode()])
 
     def close(self) -> None:
         """Stop serving."""
@@ -160,21 +160,21 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Reads a request and sends the server's answer."""
+    """Reads a request and sends the response."""
 
     timeout = _TIMEOUT
     server: _Server
 
     def do_GET(self) -> None:
-        status, answer = self.server.page.answer(self.path, self.headers.get_all("Host", []))
+        status, response = self.server.page.respond(self.path, self.headers.get_all("Host", []))
         self.send_response(status)
-        length = sum(memoryview(part).nbytes for part in answer.parts)
-        body = {"Content-Type": answer.kind, "Content-Length": length}
-        for name, value in {**_HEADERS, **answer.headers, **body}.items():
+        length = sum(memoryview(part).nbytes for part in response.parts)
+        body = {"Content-Type": response.kind, "Content-Length": length}
+        for name, value in {**_HEADERS, **response.headers, **body}.items():
             self.send_header(name, str(value))
         self.end_headers()
         with contextlib.suppress(OSError):  # the browser left
-            for part in answer.parts:
+            for part in response.parts:
                 self.wfile.write(part)
 
     def version_string(self) -> str:

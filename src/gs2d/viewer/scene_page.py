@@ -29,7 +29,7 @@ from gs2d.data.subject_box import OBJECT, Subject
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 from gs2d.viewer.opening_view import guessed_subject, opening_camera, photographed_arc
 from gs2d.viewer.packed_splats import PackedSplats, pack_splats
-from gs2d.viewer.page_server import Answer
+from gs2d.viewer.page_server import Response
 
 SHADERS = ("splat.vert", "splat.frag", "final.vert", "final.frag", "mesh.vert", "mesh.frag")
 SCRIPTS = ("camera.js", "data.js", "splats.js", "mesh.js", "photographs.js", "measure.js", "controls.js", "main.js")
@@ -58,7 +58,7 @@ class WorldScale:
 
 @dataclass(frozen=True, eq=False)
 class PageScene:
-    """What a page shows, except splats, meshes and photographs."""
+    """The content of a page, except splats, meshes and photographs."""
 
     title: str
     views: Sequence[PageView]  # at least one
@@ -67,7 +67,7 @@ class PageScene:
     unit: float  # world units: typical distance between the views and ``focus``
     up: np.ndarray  # [3]: unit vector
     subject: Subject | None = None  # the page opens at it; None: guessed from the cameras
-    world: WorldScale | None = None  # if given, the page measures in metres, else in units of the capture
+    world: WorldScale | None = None  # scale for measurements in metres; None: in units of the capture
     # False: there are no photographs; ``views`` is the opening view only, and all directions are allowed.
     is_photographed: bool = True
 
@@ -99,7 +99,7 @@ def write_page(
     meshes = meshes or {}
     packed = pack_for(scene, splats)
     offer = PageOffer(tuple(meshes), bool(photographs), served=False)
-    before, after = _page(scene, packed.facts, offer)
+    before, after = _page(scene, packed.metadata, offer)
     written = 0
     with atomic_write(Path(path)) as file:
         written += file.write(before)
@@ -121,14 +121,14 @@ def pack_for(scene: PageScene, splats: Splats) -> PackedSplats:
 
 
 def served_page(scene: PageScene, offer: PageOffer) -> bytes:
-    """Return the page without data; it requests from its server what ``offer`` names."""
+    """Return the page without data; it requests the data of ``offer`` from its server."""
     no_splats = {"splats": 0, "degree": 0, "texels": 0, "scales": [0.0] * 15}
     return b"".join(_page(scene, no_splats, offer))
 
 
-def splats_answer(packed: PackedSplats) -> Answer:
-    """Return splats as a served page requests them: the bytes as the body, their description as a header."""
-    return Answer("application/octet-stream", packed.data, {"X-Splats": json.dumps(packed.facts, allow_nan=False)})
+def splats_response(packed: PackedSplats) -> Response:
+    """Return splats as a served page requests them: the bytes as the body, their metadata as a header."""
+    return Response("application/octet-stream", packed.data, {"X-Splats": json.dumps(packed.metadata, allow_nan=False)})
 
 
 def _page(scene: PageScene, splats: Mapping[str, Any], offer: PageOffer) -> tuple[bytes, bytes]:
@@ -136,7 +136,7 @@ def _page(scene: PageScene, splats: Mapping[str, Any], offer: PageOffer) -> tupl
     subject = scene.subject
     if subject is None:
         subject = guessed_subject([view.camera for view in scene.views], scene.focus, scene.unit, scene.up)
-    facts = json.dumps({**splats, **_facts(scene, subject), "offer": asdict(offer)}, allow_nan=False)
+    metadata = json.dumps({**splats, **_metadata(scene, subject), "offer": asdict(offer)}, allow_nan=False)
     background = scene.settings.background
     is_dark = sum(background) < 1.5
     values = {
@@ -151,7 +151,7 @@ def _page(scene: PageScene, splats: Mapping[str, Any], offer: PageOffer) -> tupl
         "paper": "rgba(0,0,0,.55)" if is_dark else "rgba(255,255,255,.75)",
         "panel": "rgba(24,26,30,.93)" if is_dark else "rgba(255,255,255,.95)",
         "crop_rows": "\n".join(map(_crop_row, range(3))),
-        "facts": facts.replace("<", "\\u003c"),
+        "facts": metadata.replace("<", "\\u003c"),
         "style": _asset("page.css"),
         "shaders": "\n".join(f'<script type="x-shader" id="{name}">\n{_asset(name)}\n</script>' for name in SHADERS),
         "sorter": _asset("sorter.js"),
@@ -195,7 +195,7 @@ def _crop_row(axis: int) -> str:
     return f'<div class="row"><b class="{name}" aria-hidden="true">{name}</b>{inputs}</div>'
 
 
-def _facts(scene: PageScene, subject: Subject) -> dict[str, Any]:
+def _metadata(scene: PageScene, subject: Subject) -> dict[str, Any]:
     """Return the values that the page needs; coordinates are relative to the focus."""
     cameras, settings, origin = [view.camera for view in scene.views], scene.settings, scene.focus
     arc = photographed_arc(cameras if scene.is_photographed else (), subject, scene.up)

@@ -24,7 +24,7 @@ from gs2d.data.subject_box import LARGEST
 from gs2d.errors import RunError
 from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import write_layout
-from gs2d.io.gaussians import Gaussians, Tell
+from gs2d.io.gaussians import Gaussians, Warn
 from gs2d.io.run_dir import EDITS, SPLATS, RunFolder, make_folder, open_run
 from gs2d.pipeline.attempts import REMADE_BY, remade_by
 from gs2d.pipeline.finish.run_subject import centers_inside
@@ -72,7 +72,7 @@ def edit(path: Path, options: EditOptions, out: Path | None = None) -> dict[str,
     return {"file": str(run.file(SPLATS)), "splats": len(edited), "before": len(before), "notes": notes}
 
 
-def edited_splats(splats: Splats, options: EditOptions, warn: Tell) -> Splats:
+def edited_splats(splats: Splats, options: EditOptions, warn: Warn) -> Splats:
     """Return splats after an edit; ``warn`` receives messages about a merged file."""
     if options.keep_box is not None:
         return splats.rows(centers_inside(splats, options.keep_box, "--keep-box"))

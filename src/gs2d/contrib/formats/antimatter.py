@@ -16,7 +16,7 @@ from gs2d.core.json_files import read_bytes
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, sigmoid, unit_quats
+from gs2d.io.gaussians import Gaussians, Warn, sigmoid, unit_quats
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
@@ -63,5 +63,5 @@ register_format("splat", ending=".splat")(lambda path, splats: write_splat(path,
 
 
 @register_splat_reader("splat", endings=(".splat",))
-def _read(path: str | os.PathLike[str], _: Tell) -> tuple[Gaussians, str]:
+def _read(path: str | os.PathLike[str], _: Warn) -> tuple[Gaussians, str]:
     return read_splat(path), ".splat"

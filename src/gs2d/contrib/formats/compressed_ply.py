@@ -18,7 +18,7 @@ from gs2d.contrib.formats.quantised import logit_of_byte, morton_order, to_byte
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, sigmoid, unit_quats
+from gs2d.io.gaussians import Gaussians, Warn, drawn_bands, sigmoid, unit_quats
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 from gs2d.io.splat_ply import DISKS_COMMENT
 
@@ -101,8 +101,8 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     return np.asarray(word)
 
 
-def read_compressed_ply(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
-    """Read a compressed PLY, in file order; ``tell`` receives a message if SH bands are dropped.
+def read_compressed_ply(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> Gaussians:
+    """Read a compressed PLY, in file order; ``warn`` receives a message if SH bands are dropped.
 
     Raises DataError if the file is broken, no PLY, or has inconsistent elements.
     """
@@ -122,7 +122,7 @@ def read_compressed_ply(path: str | os.PathLike[str], tell: Tell = warnings.warn
             scale.astype(np.float32),
             logit_of_byte(to_byte(255.0 * rgba[:, 3])),
             ((color - 0.5) / C0).astype(np.float32),
-            drawn_bands(str(path), _sh(path, file.elements.get("sh"), n), tell),
+            drawn_bands(str(path), _sh(path, file.elements.get("sh"), n), warn),
         )
 
 
@@ -215,5 +215,5 @@ _register(lambda path, splats: write_compressed_ply(path, Gaussians.of(splats)))
 
 
 @register_splat_reader("compressed", ply_kind="compressed")
-def _read(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
-    return read_compressed_ply(path, tell), "compressed PLY"
+def _read(path: str | os.PathLike[str], warn: Warn) -> tuple[Gaussians, str]:
+    return read_compressed_ply(path, warn), "compressed PLY"

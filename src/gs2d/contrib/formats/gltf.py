@@ -24,13 +24,13 @@ from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit, sigmoid, unit_quats
+from gs2d.io.gaussians import Gaussians, Warn, drawn_bands, logit, sigmoid, unit_quats
 from gs2d.io.meshes import LINEAR_U16
 
 EXTENSION = "KHR_gaussian_splatting"
 _FROM_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
 _FLOAT, _USHORT, _VERTICES = 5126, 5123, 34962
-_KNOWN = {EXTENSION, "KHR_mesh_quantization"}
+_SUPPORTED = {EXTENSION, "KHR_mesh_quantization"}
 
 
 def write_gltf(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
@@ -96,14 +96,14 @@ def _attributes(gaussians: Gaussians) -> dict[str, tuple[np.ndarray, dict[str, A
     }
     for i, (degree, place) in enumerate(_places(g.sh_degree)):
         floats[f"SH_DEGREE_{degree}_COEF_{place}"] = (g.sh0 if i == 0 else g.shN[:, i - 1], "VEC3")
-    found: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
+    arrays: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
         "POSITION": (np.ascontiguousarray(g.means, "<f4"), {"componentType": _FLOAT, "type": "VEC3"}),
         "COLOR_0": (color, {"componentType": _USHORT, "type": "VEC4", "normalized": True}),
     }
     for name, (values, kind) in floats.items():
         array = np.ascontiguousarray(values, "<f4")
-        found[f"{EXTENSION}:{name}"] = (array, {"componentType": _FLOAT, "type": kind})
-    return found
+        arrays[f"{EXTENSION}:{name}"] = (array, {"componentType": _FLOAT, "type": kind})
+    return arrays
 
 
 def _places(degree: int) -> list[tuple[int, int]]:
@@ -111,31 +111,29 @@ def _places(degree: int) -> list[tuple[int, int]]:
     return [(level, place) for level in range(degree + 1) for place in range(2 * level + 1)]
 
 
-def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
+def read_gltf(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> tuple[Gaussians, str]:
     """Read all splats in the scene of a .glb or .gltf file; also returns the kind of file.
 
-    ``tell`` receives a message if SH bands above degree 3 are dropped. Raises DataError if the file is no glTF, or
+    ``warn`` receives a message if SH bands above degree 3 are dropped. Raises DataError if the file is no glTF, or
     contains no splats or unsupported ones.
     """
     document = read_document(path)
     required = document.json.get("extensionsRequired", [])
-    beyond = set(map(str, required)) - _KNOWN if isinstance(required, list) else set()
+    beyond = set(map(str, required)) - _SUPPORTED if isinstance(required, list) else set()
     if beyond:
         raise DataError(f"{path}: expected glTF that needs {EXTENSION} only, it needs {', '.join(sorted(beyond))}")
     with document.reading():
-        found = list(_primitives(document))
-        total = sum(document.bytes_of(index) for _, attributes in found for index in attributes.values())
-        check_growth(path, document.packed_bytes() if found else 0, total, "splats")
-        parts = [
-            _placed(path, _gaussians(document, attributes, tell), _FROM_GLTF @ matrix) for matrix, attributes in found
-        ]
+        primitives = list(_primitives(document))
+        total = sum(document.bytes_of(index) for _, attributes in primitives for index in attributes.values())
+        check_growth(path, document.packed_bytes() if primitives else 0, total, "splats")
+        parts = [_placed(path, _gaussians(document, a, warn), _FROM_GLTF @ matrix) for matrix, a in primitives]
     if not parts and "meshes" not in document.json and EXTENSION in document.json.get("extensionsUsed", ()):
         return _none(), "glTF"
     if not parts:
         mesh = gltf_mesh(path)
-        got = "glTF without" if mesh is None else f"a mesh of {mesh['triangles']:,} triangles"
+        content = "glTF without" if mesh is None else f"a mesh of {mesh['triangles']:,} triangles"
         raise DataError(
-            f"{path}: expected Gaussian splats ({EXTENSION}), got {got}; use the splats.ply of a run or another "
+            f"{path}: expected Gaussian splats ({EXTENSION}), got {content}; use the splats.ply of a run or another "
             "splat file"
         )
     return Gaussians.joined(parts), "glTF"
@@ -190,7 +188,7 @@ def _primitives(document: GltfDocument) -> Iterator[tuple[np.ndarray, dict[str, 
             yield matrix, attributes
 
 
-def _gaussians(document: GltfDocument, attributes: dict[str, int], tell: Tell) -> Gaussians:
+def _gaussians(document: GltfDocument, attributes: dict[str, int], warn: Warn) -> Gaussians:
     """Read one primitive, in its own frame."""
     degree = max((int(name.split("_")[2]) for name in attributes if name.startswith("SH_DEGREE_")), default=0)
     if not 0 <= degree <= 8:
@@ -212,7 +210,7 @@ def _gaussians(document: GltfDocument, attributes: dict[str, int], tell: Tell) -
         log_scales_of(scales),
         logit(opacities),
         harmonics[0],
-        drawn_bands(document.path, np.stack([*harmonics[1:]], axis=1), tell)
+        drawn_bands(document.path, np.stack([*harmonics[1:]], axis=1), warn)
         if degree
         else np.zeros((len(means), 0, 3), np.float32),
     )

@@ -147,9 +147,9 @@ def read_document(path: str | os.PathLike[str]) -> GltfDocument:
 
 def _chunks(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | None]:
     """Return the JSON and the binary chunk, if there is one, of a .glb file."""
-    found: list[tuple[bytes, bytes]] = []
+    chunks: list[tuple[bytes, bytes]] = []
     at = _HEADER.size
-    while at + _CHUNK.size <= len(data) and len(found) < 2:
+    while at + _CHUNK.size <= len(data) and len(chunks) < 2:
         length, kind = _CHUNK.unpack_from(data, at)
         chunk = data[at + _CHUNK.size : at + _CHUNK.size + length]
         if len(chunk) < length:
@@ -157,11 +157,11 @@ def _chunks(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | N
                 f"{os.fspath(path)}: the file ends early ({length} more bytes expected, {len(chunk)} left); "
                 "copy or export it again"
             )
-        found.append((kind, chunk))
+        chunks.append((kind, chunk))
         at += _CHUNK.size + length
-    if not found or found[0][0] != b"JSON" or _HEADER.unpack_from(data)[1] != 2:
+    if not chunks or chunks[0][0] != b"JSON" or _HEADER.unpack_from(data)[1] != 2:
         raise DataError(f"{os.fspath(path)}: expected glTF 2.0, but the chunks are invalid; export it again")
-    return found[0][1], found[1][1] if len(found) > 1 and found[1][0] == b"BIN\0" else None
+    return chunks[0][1], chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
 
 
 def node_matrices(document: GltfDocument) -> Iterator[tuple[np.ndarray, int]]:
@@ -169,11 +169,11 @@ def node_matrices(document: GltfDocument) -> Iterator[tuple[np.ndarray, int]]:
     nodes, scenes = document.json.get("nodes", []), document.json.get("scenes", [])
     roots = scenes[_whole(document.json.get("scene", 0))].get("nodes", []) if scenes else range(len(nodes))
     waiting = [(np.eye(4), _whole(node), 0) for node in roots]
-    left = len(nodes) + 1  # a node has one parent
+    remaining = len(nodes) + 1  # a node has one parent
     while waiting:
         above, index, depth = waiting.pop()
-        left -= 1
-        if left < 0 or depth > _DEEPEST:
+        remaining -= 1
+        if remaining < 0 or depth > _DEEPEST:
             raise DataError(f"{document.path}: expected nodes with one parent each; export the file again")
         node = nodes[index]
         matrix = above @ _matrix(node)

@@ -18,9 +18,9 @@ from gs2d.io.gaussians import Gaussians, logit, sigmoid, unit_quats, with_thickn
 
 _NEIGHBOURS = 10
 _COLOR = 100.0  # weight of a squared colour difference (in [0, 1]) relative to the logarithm of a volume
-_THICK = 0.01  # of the mean squared scale: thickness of disks in logarithms of volumes
+_THICK = 0.01  # thickness of disks in logarithms of volumes, as a fraction of the mean squared scale
 _OPAQUE = 0.999
-_PASSES = 12  # of merging disjoint pairs, until half of the splats are left
+_PASSES = 12  # limit on passes that merge disjoint pairs
 
 
 def halved(g: Gaussians, cells: np.ndarray) -> tuple[Gaussians, np.ndarray]:
@@ -96,7 +96,7 @@ def _cheapest(g: Gaussians, cells: np.ndarray, most: int) -> np.ndarray:
 def _matching(pairs: np.ndarray, cost: np.ndarray, count: int) -> np.ndarray:
     """Return the greedy matching: repeatedly the cheapest pair of unmatched splats; by increasing cost."""
     order = np.argsort(cost, kind="stable")
-    pairs, taken, found = pairs[order], np.zeros(count, bool), []
+    pairs, matched, parts = pairs[order], np.zeros(count, bool), []
     while len(pairs):
         # A pair that is the cheapest for both of its splats is in the greedy matching.
         best = np.full(count, len(pairs))
@@ -104,14 +104,14 @@ def _matching(pairs: np.ndarray, cost: np.ndarray, count: int) -> np.ndarray:
         np.minimum.at(best, pairs[:, 0], rank)
         np.minimum.at(best, pairs[:, 1], rank)
         sure = (best[pairs[:, 0]] == rank) & (best[pairs[:, 1]] == rank)
-        found.append((order[sure], pairs[sure]))
-        taken[pairs[sure]] = True
-        free = ~(taken[pairs[:, 0]] | taken[pairs[:, 1]])
+        parts.append((order[sure], pairs[sure]))
+        matched[pairs[sure]] = True
+        free = ~(matched[pairs[:, 0]] | matched[pairs[:, 1]])
         pairs, order = pairs[free], order[free]
-    if not found:
+    if not parts:
         return np.zeros((0, 2), int)
-    whole = np.concatenate([some for _, some in found])
-    return whole[np.argsort(cost[np.concatenate([some for some, _ in found])], kind="stable")]
+    whole = np.concatenate([some for _, some in parts])
+    return whole[np.argsort(cost[np.concatenate([some for some, _ in parts])], kind="stable")]
 
 
 def _overlap(g: Gaussians, pairs: np.ndarray, mass: np.ndarray, plane: np.ndarray) -> np.ndarray:

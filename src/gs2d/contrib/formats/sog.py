@@ -29,7 +29,7 @@ from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_entries, check_growth
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, sigmoid, unit_quats
+from gs2d.io.gaussians import Gaussians, Warn, drawn_bands, sigmoid, unit_quats
 
 _ROW = 64  # palette rows per image row
 _LONGEST = 16 << 20  # bytes of a JSON file
@@ -126,23 +126,23 @@ def _packed_harmonics(shN: np.ndarray, shape: tuple[int, int]) -> tuple[dict[str
     return meta, images
 
 
-def read_sog(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
+def read_sog(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> tuple[Gaussians, str]:
     """Read a .sog file, the meta.json of a folder, or the finest level of a lod-meta.json.
 
-    ``tell`` receives a message if SH bands above degree 3 are dropped. Raises DataError if the file is missing,
+    ``warn`` receives a message if SH bands above degree 3 are dropped. Raises DataError if the file is missing,
     damaged, or of another kind or version.
     """
     path = Path(path)
     try:
         if path.name.lower() == "lod-meta.json":
-            return read_level(path, tell=tell), "streamed SOG, its finest level"
+            return read_level(path, warn=warn), "streamed SOG, its finest level"
         if path.suffix.lower() == ".json":
             fetch, size = _in_folder(path.parent, path), path.stat().st_size
-            return _SogReader(path, fetch, size, tell).read(path.name), "SOG, unpacked"
+            return _SogReader(path, fetch, size, warn).read(path.name), "SOG, unpacked"
         with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
             check_entries(path, archive.infolist())
             size = path.stat().st_size
-            return _SogReader(path, lambda name: _of_archive(path, archive, name), size, tell).read(), "SOG"
+            return _SogReader(path, lambda name: _of_archive(path, archive, name), size, warn).read(), "SOG"
     except OSError as error:
         raise DataError(f"cannot read {error.filename or path}: {error.strerror or error}") from error
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
@@ -172,8 +172,8 @@ def _in_folder(home: Path, source: Path) -> Fetch:
 class _SogReader:
     """Reads one SOG data set, with files fetched by name; ``size`` is the number of compressed bytes read so far."""
 
-    def __init__(self, path: Path, fetch: Fetch, size: int, tell: Tell) -> None:
-        self.path, self.fetch, self.size, self.tell = path, fetch, size, tell
+    def __init__(self, path: Path, fetch: Fetch, size: int, warn: Warn) -> None:
+        self.path, self.fetch, self.size, self.warn = path, fetch, size, warn
 
     def read(self, name: str = "meta.json") -> Gaussians:
         """Return the splats."""
@@ -228,7 +228,7 @@ class _SogReader:
             raise ValueError(f"expected labels below {len(centers)}, got {which.max()}")
         packed = count * coefficients * 12
         check_growth(self.path, self.size, packed, f"a cloud of splats ({count:,} of them)")
-        return _values(entry, drawn_bands(self.path, centers[which], self.tell))
+        return _values(entry, drawn_bands(self.path, centers[which], self.warn))
 
     def _rows(self, count: int, width: int, name: str) -> np.ndarray:
         """Return the pixels of the splats [N, width] in an image."""
@@ -303,7 +303,7 @@ def _quats(packed: np.ndarray) -> np.ndarray:
     return q.astype(np.float32)
 
 
-def read_level(path: Path, level: int = 0, tell: Tell = warnings.warn) -> Gaussians:
+def read_level(path: Path, level: int = 0, warn: Warn = warnings.warn) -> Gaussians:
     """Read one level of a lod-meta.json, with its environment; 0 is the finest.
 
     If a leaf does not have that level, its next coarser one is read, or else its coarsest.
@@ -311,16 +311,16 @@ def read_level(path: Path, level: int = 0, tell: Tell = warnings.warn) -> Gaussi
     index = parsed(path, path.read_bytes())
     fetch, parts = _in_folder(path.parent, path), []
     try:
-        names, wanted = index["filenames"], _places(index["tree"], level)
+        names, chunks = index["filenames"], _places(index["tree"], level)
         files: dict[int, Gaussians] = {}
-        for file, offset, count in wanted:
+        for file, offset, count in chunks:
             if file not in files:
-                files[file] = _data_set(path, fetch, names[file], tell)
+                files[file] = _data_set(path, fetch, names[file], warn)
             if offset < 0 or count < 0 or offset + count > len(files[file]):
                 raise ValueError(f"expected splats {offset} to {offset + count} in a chunk of {len(files[file])}")
             parts.append(files[file].rows(np.arange(offset, offset + count)))
         if index.get("environment") is not None:
-            parts.append(_data_set(path, fetch, index["environment"], tell))
+            parts.append(_data_set(path, fetch, index["environment"], warn))
         if not parts:
             raise ValueError("no chunk of the finest level")
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
@@ -332,30 +332,30 @@ def read_level(path: Path, level: int = 0, tell: Tell = warnings.warn) -> Gaussi
     return Gaussians.joined(parts)
 
 
-def _data_set(path: Path, fetch: Fetch, name: Any, tell: Tell) -> Gaussians:
+def _data_set(path: Path, fetch: Fetch, name: Any, warn: Warn) -> Gaussians:
     if not isinstance(name, str):
         raise TypeError("expected names of chunks")
     folder = name.rpartition("/")[0]
-    reader = _SogReader(path, lambda inner: fetch(f"{folder}/{inner}" if folder else inner), 0, tell)
+    reader = _SogReader(path, lambda inner: fetch(f"{folder}/{inner}" if folder else inner), 0, warn)
     return reader.read(name.rpartition("/")[2])
 
 
-def _places(tree: Any, wanted: int) -> list[tuple[int, int, int]]:
+def _places(tree: Any, finest: int) -> list[tuple[int, int, int]]:
     """Return the distinct (file, offset, count) of one level of every leaf."""
-    found: dict[tuple[int, int], int] = {}
+    counts: dict[tuple[int, int], int] = {}
     waiting = [tree]
     while waiting:
         node = waiting.pop()
         waiting += node.get("children") or []
         if "lods" in node:
             levels = {int(level): place for level, place in node["lods"].items()}
-            place = levels[min((level for level in levels if level >= wanted), default=max(levels))]
+            place = levels[min((level for level in levels if level >= finest), default=max(levels))]
             file, offset, count = (int(place[key]) for key in ("file", "offset", "count"))
-            if file < 0 or found.setdefault((file, offset), count) != count:
+            if file < 0 or counts.setdefault((file, offset), count) != count:
                 raise ValueError("expected each splat of a level once")
-        if len(found) > _MOST_CHUNKS or len(waiting) > _MOST_CHUNKS:
+        if len(counts) > _MOST_CHUNKS or len(waiting) > _MOST_CHUNKS:
             raise ValueError(f"expected at most {_MOST_CHUNKS} chunks")
-    return [(file, offset, count) for (file, offset), count in sorted(found.items())]
+    return [(file, offset, count) for (file, offset), count in sorted(counts.items())]
 
 
 register_format("sog", ending=".sog")(lambda path, splats: write_sog(path, Gaussians.of(splats)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-_ROUNDS = 12  # of a codebook
+_ROUNDS = 12  # k-means iterations of a codebook
 _PALETTE_ROUNDS = 5
 _LEARNT_FROM = 150_000  # random splats from which a palette is computed
 _GROUP = 512  # rows of a palette
@@ -67,14 +67,15 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     data, some = torch.from_numpy(rows), torch.from_numpy(learnt)
     groups = _means(some, max(count // _GROUP, 1), generator)
     members, homes = _split(_nearest(some, groups), len(groups)), _split(_nearest(data, groups), len(groups))
-    found, labels, before = [], np.empty(len(rows), np.int64), 0
-    for own, asked, wanted in zip(members, homes, _shares(np.array([len(own) for own in members]), count), strict=True):
-        centers = some[own] if wanted == len(own) else _means(some[own], int(wanted), generator)
+    parts, labels, before = [], np.empty(len(rows), np.int64), 0
+    shares = _shares(np.array([len(own) for own in members]), count)
+    for own, assigned, share in zip(members, homes, shares, strict=True):
+        centers = some[own] if share == len(own) else _means(some[own], int(share), generator)
         if len(centers):
-            labels[asked.numpy()] = before + _nearest(data[asked], centers).numpy()
-        found.append(centers)
+            labels[assigned.numpy()] = before + _nearest(data[assigned], centers).numpy()
+        parts.append(centers)
         before += len(centers)
-    return torch.cat(found).numpy(), labels
+    return torch.cat(parts).numpy(), labels
 
 
 def _shares(sizes: np.ndarray, count: int) -> np.ndarray:

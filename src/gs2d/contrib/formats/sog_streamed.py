@@ -1,7 +1,7 @@
 """Write the streamed form of SOG: levels of detail in spatial chunks, which a viewer loads on demand.
 
 ``lod-meta.json`` contains a tree of boxes. Each leaf refers, for every level, to its splats in an SOG data set (file,
-offset, count); level 0 is the finest. Its ``errors`` say how much each level deviates from the finest. The folders of
+offset, count); level 0 is the finest. Its ``errors`` are the deviations of the levels from the finest. The folders of
 the data sets are beside it. Follows the format description (developer.playcanvas.com, version 1, with ``lodErrors``).
 """
 
@@ -32,12 +32,12 @@ from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 
 INDEX = "lod-meta.json"
-LEVELS = 4  # at least: 1, 1/2, 1/4 and 1/8 of the splats
+LEVELS = 4  # minimum: 1, 1/2, 1/4 and 1/8 of the splats
 _MOST_LEVELS, _COARSEST = 8, 250_000  # further levels are added until the coarsest has at most this many splats
 _LEAF = 16_384  # largest number of splats of the finest level in a leaf
 _FILE = 131_072  # approximate number of splats in a data set
 _VIEW = 256  # px, side of the images that compare levels: about two per splat of a full leaf on a surface
-_DISTANCE = 8.0  # of their cameras from the middle of a leaf, in radii of its box
+_DISTANCE = 8.0  # distance of their cameras from the centre of a leaf, in radii of its box
 _REACH = 3.0  # standard deviations of splats that a box contains
 _PARTS = ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
 
@@ -73,16 +73,16 @@ def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians) -> No
     path = Path(path)
     older = _listed(path)
     tree, cells = _divided(gaussians.means)
-    made = list(_made(gaussians, cells, int(cells.max(initial=0)) + 1, _levels_for(len(gaussians))))
+    levels = list(_coarsened(gaussians, cells, int(cells.max(initial=0)) + 1, _levels_for(len(gaussians))))
     with _new_folders(path) as folder:
-        index = _written(path.parent, folder, made)
-        bounds = [level.bounds() for level in made]
+        index = _written(path.parent, folder, levels)
+        bounds = [level.bounds() for level in levels]
         low, high = (f([ends[k] for ends in bounds], axis=0) for k, f in ((0, np.min), (1, np.max)))
         leaves = [{"lods": lods} for lods in index.pop("leaves")]
         with contextlib.suppress(BackendError):  # without the native library readers estimate errors from the counts
             backend = get_backend("cpu")
             for number, leaf in enumerate(leaves):
-                parts = [level.gaussians.rows(np.arange(*level.ends[number : number + 2])) for level in made]
+                parts = [level.gaussians.rows(np.arange(*level.ends[number : number + 2])) for level in levels]
                 leaf["errors"] = _errors(parts, low[number], high[number], backend)
             index["lodErrors"] = True
         index["tree"] = _node(tree, low, high, leaves)
@@ -118,7 +118,7 @@ def _divided(means: np.ndarray) -> tuple[Any, np.ndarray]:
     return divide(np.arange(len(means))), cells
 
 
-def _made(g: Gaussians, cells: np.ndarray, leaves: int, levels: int) -> Iterator[_Level]:
+def _coarsened(g: Gaussians, cells: np.ndarray, leaves: int, levels: int) -> Iterator[_Level]:
     for level in range(levels):
         if level:
             g, cells = halved(g, cells)
@@ -168,7 +168,7 @@ def _write_set(folder: Path, g: Gaussians) -> None:
 
 
 def _errors(levels: list[Gaussians], low: np.ndarray, high: np.ndarray, backend: Backend) -> list[float]:
-    """Return how much each level of a leaf deviates from the finest, finite and not decreasing.
+    """Return the deviation of each level of a leaf from the finest, finite and not decreasing.
 
     The measure is that of SplatTransform: squared differences of images, with alpha, relative to the squared images of
     the finest level, summed over views along the six directions of the axes. Only ratios of the errors matter.
@@ -205,11 +205,11 @@ def _node(tree: Any, low: np.ndarray, high: np.ndarray, leaves: list[dict[str, A
 @contextlib.contextmanager
 def _new_folders(path: Path) -> Iterator[str]:
     """Yield a pattern for names of new folders beside ``path``; they are removed if the body fails."""
-    made = False
+    created = False
     try:
         if not path.parent.is_dir():
             path.parent.mkdir()
-            made = True
+            created = True
         there = os.listdir(path.parent)
     except OSError as error:
         raise disk_error(path.parent, error) from error
@@ -221,14 +221,14 @@ def _new_folders(path: Path) -> Iterator[str]:
         for name in os.listdir(path.parent):
             if name not in there and _numbered(name, tail):
                 _remove(path.parent / name)
-        if made:
+        if created:
             with contextlib.suppress(OSError):
                 path.parent.rmdir()
         raise
 
 
 def _numbered(name: str, tail: str) -> bool:
-    """Whether a name is that of a data set with this suffix."""
+    """Return whether a name is that of a data set with this suffix."""
     if not name.endswith(tail):
         return False
     parts = name[: len(name) - len(tail)].split("_")

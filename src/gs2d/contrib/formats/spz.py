@@ -29,14 +29,14 @@ from gs2d.core.growth import check_growth
 from gs2d.core.json_files import read_bytes
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import THIN, Gaussians, Tell, drawn_bands, sigmoid, unit_quats, with_thickness
+from gs2d.io.gaussians import THIN, Gaussians, Warn, drawn_bands, sigmoid, unit_quats, with_thickness
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")
 _HEADER_4 = struct.Struct("<IIIBBBBI12x")
 _SIZES = struct.Struct("<QQ")
 _WINDOW = 1 << 26  # bytes; largest window of a zstd stream
-_LARGEST = (1 << 23) - 1  # of a signed 24-bit integer
+_LARGEST = (1 << 23) - 1  # largest signed 24-bit integer
 _EXTENDED = 0x2  # flag: the file has records
 _RECORD, _COORDINATES = struct.Struct("<II"), 0xADBE0003  # header of a record; type of the coordinate system
 _RECORDS = 1 << 20  # bytes; largest size of all records
@@ -61,7 +61,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: in
     farthest = float(np.abs(g.means).max()) if len(g) else 0.0
     bits = _fractional_bits(g, farthest)
     if farthest > _LARGEST:
-        raise DataError(f"SPZ holds positions up to {_LARGEST} units, got {farthest:.4g}; use --format 3dgs")
+        raise DataError(f"SPZ stores positions up to {_LARGEST} units, got {farthest:.4g}; use --format 3dgs")
     streams = [array.tobytes() for array in _streams(g, bits)]
     parts = _parts_4(g, bits, streams) if version == 4 else _parts_3(g, bits, streams)
     with atomic_write(path) as file:
@@ -147,16 +147,16 @@ def _losses(g: Gaussians) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def read_spz(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, int]:
+def read_spz(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> tuple[Gaussians, int]:
     """Read SPZ of version 2, 3 or 4; returns (Gaussians, version).
 
-    The smallest scale of SPZ, 4.5e-5 units, is read as the thickness of a disk if it is the third. ``tell`` receives a
+    The smallest scale of SPZ, 4.5e-5 units, is read as the thickness of a disk if it is the third. ``warn`` receives a
     message if SH bands above degree 3 are dropped. Raises DataError if the file is missing, of another kind or version,
     or truncated, and BackendError for version 4 without zstandard.
     """
     packed = read_bytes(path)
     version, bits, system, parts = (_parts_of_4 if packed[:4] == b"NGSP" else _parts_of_3)(path, packed)
-    return _in_our_axes(_gaussians(path, version, bits, parts, tell), system), version
+    return _in_our_axes(_gaussians(path, version, bits, parts, warn), system), version
 
 
 def _in_our_axes(g: Gaussians, system: int) -> Gaussians:
@@ -253,14 +253,14 @@ def _unzstd(path: str | os.PathLike[str], packed: bytes, size: int) -> bytes:
         raise DataError(f"{os.fspath(path)}: expected SPZ, but its zstd is broken ({error}); copy it again") from error
 
 
-def _gaussians(path: str | os.PathLike[str], version: int, bits: int, parts: list[np.ndarray], tell: Tell) -> Gaussians:
+def _gaussians(path: str | os.PathLike[str], version: int, bits: int, parts: list[np.ndarray], warn: Warn) -> Gaussians:
     """Dequantize splats, in the coordinates of the file."""
     count = len(parts[0])
     positions, alphas, colors, scales, rotations, sh = parts
     low = positions.reshape(count, 3, 3).astype(np.int32)
     fixed = low[..., 0] | (low[..., 1] << 8) | (low[..., 2] << 16)
     fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
-    sh = drawn_bands(path, sh.reshape(count, sh.shape[1] // 3, 3), tell)
+    sh = drawn_bands(path, sh.reshape(count, sh.shape[1] // 3, 3), warn)
     log_scales = scales.astype(np.float32) / 16.0 - 10.0
     thinnest = scales[:, 2] == 0
     log_scales[thinnest] = with_thickness(log_scales[thinnest, :2])
@@ -307,9 +307,9 @@ def _old_quats(rotations: np.ndarray) -> np.ndarray:
     return _completed(q, np.full(len(q), 3))
 
 
-def _completed(q: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """Complete (x, y, z, w) whose ``left_out`` component is 0, and return (w, x, y, z)."""
-    q[np.arange(len(q)), left_out] = np.sqrt(np.maximum(0.0, 1.0 - np.square(q).sum(axis=1)))
+def _completed(q: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Complete (x, y, z, w) whose ``largest`` component is not stored, and return (w, x, y, z)."""
+    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(0.0, 1.0 - np.square(q).sum(axis=1)))
     return q[:, [3, 0, 1, 2]].astype(np.float32)
 
 
@@ -318,6 +318,6 @@ register_format("spz4", ending=".spz")(lambda path, splats: write_spz(path, Gaus
 
 
 @register_splat_reader("spz", endings=(".spz",))
-def _read(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
-    gaussians, version = read_spz(path, tell)
+def _read(path: str | os.PathLike[str], warn: Warn) -> tuple[Gaussians, str]:
+    gaussians, version = read_spz(path, warn)
     return gaussians, f"SPZ version {version}"

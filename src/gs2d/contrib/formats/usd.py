@@ -27,7 +27,7 @@ from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.extras import install
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
-from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit, sigmoid, unit_quats, with_thickness
+from gs2d.io.gaussians import Gaussians, Warn, drawn_bands, logit, sigmoid, unit_quats, with_thickness
 
 ENDINGS = (".usd", ".usdc", ".usda", ".usdz")
 _APIS = (
@@ -118,42 +118,42 @@ def _schema_quats(quats: np.ndarray) -> np.ndarray:
 def _save(pxr: Any, path: Path, layer: Any) -> None:
     """Write a layer to a temporary folder, because OpenUSD requires its own suffixes, and copy it atomically."""
     with tempfile.TemporaryDirectory(prefix="gs2d-usd-") as home:
-        made = Path(home, "splats.usdc")
+        temporary = Path(home, "splats.usdc")
         try:
-            written = layer.Export(str(made))
+            written = layer.Export(str(temporary))
         except pxr.Tf.ErrorException as error:
-            raise disk_error(made, OSError(None, " ".join(str(error).split())[:200])) from error
+            raise disk_error(temporary, OSError(None, " ".join(str(error).split())[:200])) from error
         if not written:
-            raise disk_error(made, OSError(None, "OpenUSD could not write"))
-        with open(made, "rb") as source, atomic_write(path) as file:
+            raise disk_error(temporary, OSError(None, "OpenUSD could not write"))
+        with open(temporary, "rb") as source, atomic_write(path) as file:
             while block := source.read(1 << 20):
                 file.write(block)
 
 
-def read_usd(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
+def read_usd(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> tuple[Gaussians, str]:
     """Read all particle fields of an OpenUSD file, in the frame of its stage; also returns their kernels.
 
-    The third scale of surflets is ignored. ``tell`` receives a message if SH bands above degree 3 are dropped. Raises
+    The third scale of surflets is ignored. ``warn`` receives a message if SH bands above degree 3 are dropped. Raises
     DataError if the file is missing, no OpenUSD, or has no such fields, or an unsupported kernel or transform, and
     BackendError if OpenUSD is not installed.
     """
-    facts, data = _ask(path)
+    header, data = _read_isolated(path)
     fields, at = [], 0
-    for fact in facts["fields"]:
+    for entry in header["fields"]:
         arrays = {}
-        for name, width in fact["arrays"].items():
-            size = fact["count"] * width
-            arrays[name] = np.frombuffer(data, "<f4", size, at).reshape(fact["count"], width)
+        for name, width in entry["arrays"].items():
+            size = entry["count"] * width
+            arrays[name] = np.frombuffer(data, "<f4", size, at).reshape(entry["count"], width)
             at += 4 * size
-        fields.append(_gaussians(path, fact, arrays, tell))
+        fields.append(_gaussians(path, entry, arrays, warn))
     if not fields:
         raise DataError(f"{os.fspath(path)}: expected a ParticleField, but the stage has none; export splats to it")
-    kernels = sorted({fact["kernel"] for fact in facts["fields"]})
+    kernels = sorted({entry["kernel"] for entry in header["fields"]})
     return Gaussians.joined(fields), "OpenUSD, " + " and ".join(f"{kernel}s" for kernel in kernels)
 
 
-def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
-    """Read a file in a separate process; returns facts, and the bytes of the arrays."""
+def _read_isolated(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
+    """Read a file in a separate process; return its header, and the bytes of the arrays."""
     required_usd()
     try:
         size = os.stat(path).st_size
@@ -163,23 +163,23 @@ def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
         raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
     most, seconds = _ADDRESSES + _RATIO * size, _SECONDS + size // _RATE
     try:
-        status, said = _read_apart(os.path.abspath(path), most, seconds)
+        status, output = _read_apart(os.path.abspath(path), most, seconds)
     except subprocess.TimeoutExpired as error:
         raise DataError(
             f"{os.fspath(path)}: reading OpenUSD took more than {error.timeout:.0f} s; do not trust the file"
         ) from error
-    line, _, _ = said.partition(b"\n")
+    line, _, _ = output.partition(b"\n")
     try:
-        facts = json.loads(line)
+        header = json.loads(line)
     except ValueError:
         raise DataError(
             f"{os.fspath(path)}: expected OpenUSD, but its reader failed (status {status}); copy or "
             "export the file again"
         ) from None
-    if "error" in facts:
-        raise DataError(f"{os.fspath(path)}: {facts['error']}")
-    data = memoryview(said)[len(line) + 1 :]
-    return facts, data
+    if "error" in header:
+        raise DataError(f"{os.fspath(path)}: {header['error']}")
+    data = memoryview(output)[len(line) + 1 :]
+    return header, data
 
 
 def _read_apart(path: str, most: int, seconds: int) -> tuple[int, bytes]:
@@ -192,12 +192,12 @@ def _read_apart(path: str, most: int, seconds: int) -> tuple[int, bytes]:
 
 
 def _gaussians(
-    path: str | os.PathLike[str], fact: dict[str, Any], arrays: dict[str, np.ndarray], tell: Tell
+    path: str | os.PathLike[str], entry: dict[str, Any], arrays: dict[str, np.ndarray], warn: Warn
 ) -> Gaussians:
     """Convert one field, with the defaults of the schema."""
-    where, count = f"{path}: {fact['path']}", fact["count"]
-    if fact["kernel"] not in ("surflet", "ellipsoid"):
-        raise DataError(f"{where}: expected a kernel of Gaussian surflets or ellipsoids, got {fact['kernel']}")
+    where, count = f"{path}: {entry['path']}", entry["count"]
+    if entry["kernel"] not in ("surflet", "ellipsoid"):
+        raise DataError(f"{where}: expected a kernel of Gaussian surflets or ellipsoids, got {entry['kernel']}")
     opacities = arrays.get("opacities", np.ones((count, 1), np.float32))
     if ((opacities < 0) | (opacities > 1)).any():  # NaN is dropped later
         raise DataError(f"{where}: expected opacities from 0 to 1; export the file again")
@@ -214,12 +214,12 @@ def _gaussians(
         log_scales,
         logit(opacities[:, 0]),
         harmonics[:, 0].copy(),
-        drawn_bands(path, harmonics[:, 1:], tell).copy(),
+        drawn_bands(path, harmonics[:, 1:], warn).copy(),
     )
     exact = _exact(raw, scales, opacities[:, 0], quats, arrays)
-    if fact["kernel"] == "surflet":
+    if entry["kernel"] == "surflet":
         exact = replace(exact, log_scales=with_thickness(exact.log_scales[:, :2]))
-    return _placed(where, exact, np.array(fact["matrix"]))
+    return _placed(where, exact, np.array(entry["matrix"]))
 
 
 def _exact(

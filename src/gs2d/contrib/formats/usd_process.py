@@ -1,7 +1,7 @@
 """Read the particle fields of an OpenUSD file in a separate process: ``python usd_process.py FILE BYTES SECONDS``.
 
 A malicious file can crash OpenUSD's parser or exhaust the memory, so it is parsed here, with limits of address space
-and CPU time. The output is a line of JSON with facts or ``{"error": ...}``, followed by the arrays that it names,
+and CPU time. The output is a header (a line of JSON, or ``{"error": ...}``), followed by the arrays that it names,
 float32. Nothing of gs2d is imported, so that the process starts quickly.
 """
 
@@ -60,9 +60,9 @@ def _check_inside(Sdf: Any, root: Any, home: Path) -> None:
             path = Path(os.path.realpath(name.partition("[")[0]))
             if not (path.is_file() and path.is_relative_to(home)):
                 raise _UnfitError(_OUTSIDE.format(repr(asset)))
-            found = Sdf.Layer.FindOrOpen(name)
-            if found is not None:
-                layers.append(found)
+            dependency = Sdf.Layer.FindOrOpen(name)
+            if dependency is not None:
+                layers.append(dependency)
 
 
 def _values(prim: Any, name: str, width: int, when: Any, *, half: bool) -> np.ndarray | None:
@@ -80,7 +80,7 @@ def _values(prim: Any, name: str, width: int, when: Any, *, half: bool) -> np.nd
 
 
 def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """Return the facts and arrays of one particle field. Arrays that are too short are ignored, as in the schema."""
+    """Return header and arrays of one particle field. Arrays that are too short are ignored, as in the schema."""
     applied = prim.GetAppliedSchemas()
     kernels = [kernel for api, kernel in _KERNELS.items() if api in applied]
     arrays = {name: _values(prim, name, width, when, half=True) for name, width in _ARRAYS.items()}
@@ -96,21 +96,21 @@ def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.nd
     if harmonics is not None and len(harmonics) >= count * coefficients:
         arrays["harmonics"] = harmonics[: count * coefficients].reshape(count, 3 * coefficients)
     arrays |= {name: _values(prim, _OWN + name, width, when, half=False) for name, width in _OWN_ARRAYS.items()}
-    kept = {name: array[:count] for name, array in arrays.items() if array is not None and len(array) >= count}
+    complete = {name: array[:count] for name, array in arrays.items() if array is not None and len(array) >= count}
     matrix = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
     if not np.isfinite(matrix).all():
         raise _UnfitError(f"expected a transform of finite numbers for {prim.GetPath()}")
-    facts = {
+    entry = {
         "path": str(prim.GetPath()),
         "kernel": kernels[-1] if kernels else "none",
         "count": count,
         "matrix": matrix.T.tolist(),  # USD's vectors are rows
-        "arrays": {name: array.shape[1] for name, array in kept.items()},
+        "arrays": {name: array.shape[1] for name, array in complete.items()},
     }
-    return facts, list(kept.values())
+    return entry, list(complete.values())
 
 
-def _found(path: str) -> tuple[dict[str, Any], list[np.ndarray]]:
+def _read(path: str) -> tuple[dict[str, Any], list[np.ndarray]]:
     from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol
 
     delegate = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses terminal output
@@ -131,8 +131,8 @@ def _found(path: str) -> tuple[dict[str, Any], list[np.ndarray]]:
         raise _UnfitError(f"expected OpenUSD, but its reader reports: {words}; copy or export it again") from error
     finally:
         delegate.TakeUncoalescedDiagnostics()
-    facts = {"fields": [fact for fact, _ in fields]}
-    return facts, [array for _, arrays in fields for array in arrays]
+    header = {"fields": [entry for entry, _ in fields]}
+    return header, [array for _, arrays in fields for array in arrays]
 
 
 def main(path: str, most: str, seconds: str) -> None:
@@ -140,12 +140,12 @@ def main(path: str, most: str, seconds: str) -> None:
     _limit(int(most), int(seconds))
     arrays: list[np.ndarray] = []
     try:
-        facts, arrays = _found(path)
+        header, arrays = _read(path)
     except _UnfitError as error:
-        facts = {"error": str(error)}
+        header = {"error": str(error)}
     except MemoryError:
-        facts = {"error": "the splats need more memory than a file of this size may use"}
-    sys.stdout.buffer.write(json.dumps(facts).encode() + b"\n")
+        header = {"error": "the splats need more memory than a file of this size may use"}
+    sys.stdout.buffer.write(json.dumps(header).encode() + b"\n")
     for array in arrays:
         sys.stdout.buffer.write(np.ascontiguousarray(array, "<f4").data)
     sys.stdout.buffer.flush()

@@ -1,1 +1,1 @@
-"""Splats in the files of other tools, one file a format."""
+"""Splat files by format."""

@@ -16,11 +16,11 @@ from gs2d.core.missing import suggestion
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io import splat_ply
-from gs2d.io.gaussians import NO_SCALE, Gaussians, Tell, logit
+from gs2d.io.gaussians import NO_SCALE, Gaussians, Warn, logit
 from gs2d.io.splat_ply import ply_kind, read_gaussians
 
 Writer = Callable[[Path, Splats], tuple[str, ...] | None]
-Reader = Callable[[str | os.PathLike[str], Tell], tuple[Gaussians, str]]
+Reader = Callable[[str | os.PathLike[str], Warn], tuple[Gaussians, str]]
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class SplatReader:
     """A format from which splats are read."""
 
     endings: tuple[str, ...]  # suffixes of the file names; those that begin with / are whole names
-    # Takes a path and a function that receives messages; returns the Gaussians and a description of the kind of file
+    # Reads a path, with a function that receives messages; returns the Gaussians and a description of the kind of file
     # ("2dgs" for flat splats).
     read: Reader
     ply_kind: str | None = None  # kind of PLY files, from ``splat_ply.ply_kind``, that it reads
-    # Returns the facts of a file that contains a mesh instead of splats, or None.
+    # Returns statistics of a file that contains a mesh instead of splats, or None.
     mesh: Callable[[Path], dict[str, Any] | None] | None = None
 
 
@@ -69,7 +69,7 @@ def register_format(
     Parameters
     ----------
     name : str
-        Name of the layout, for ``layout=`` and ``gs2d export --format``; must not be taken.
+        Name of the layout, for ``layout=`` and ``gs2d export --format``; must be unique.
     ending : str
         Suffix of the file names, with its dot; if it begins with /, it is the whole file name.
     size : callable, optional
@@ -109,7 +109,7 @@ def register_splat_reader(
     Parameters
     ----------
     name : str
-        Name of the format; must not be taken by another reader.
+        Name of the format; must be unique.
     endings : tuple of str
         Suffixes of the file names, with their dots; those that begin with / are whole file names.
     ply_kind, mesh : optional
@@ -118,8 +118,8 @@ def register_splat_reader(
     Returns
     -------
     callable
-        Decorates a function ``(path, tell)`` that returns ``gs2d.io.gaussians.Gaussians`` and a description of the
-        kind of file, and calls ``tell`` with a message for each thing that it dropped.
+        Decorates a function ``(path, warn)`` that returns ``gs2d.io.gaussians.Gaussians`` and a description of the
+        kind of file, and calls ``warn`` with a message about dropped content.
     """
 
     def registered(read: Reader) -> Reader:
@@ -206,8 +206,8 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str | 
     path = Path(path)
     chosen = layout_of(path) if layout is None else layout
     if chosen is None:
-        known = ", ".join(endings()).replace("/", "")
-        raise DataError(f"splats are written as {known}, got {path}; choose such a name, or set the layout")
+        suffixes = ", ".join(endings()).replace("/", "")
+        raise DataError(f"splats are written as {suffixes}, got {path}; choose such a name, or set the layout")
     ending = LAYOUTS.get(chosen).ending
     if not f"/{path.name}".lower().endswith(ending):
         raise DataError(
@@ -224,14 +224,14 @@ def written_bytes(path: Path, layout: str) -> int:
     return path.stat().st_size if size is None else size(path)
 
 
-def _read_ply(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
+def _read_ply(path: str | os.PathLike[str], warn: Warn) -> tuple[Gaussians, str]:
     kind = ply_kind(path)
     for _, reader in SPLAT_READERS.working():
         if reader.ply_kind == kind:
-            return reader.read(path, tell)
+            return reader.read(path, warn)
     if kind == "3dgs":
-        return read_gaussians(path, tell), "3dgs (three scales, for viewers)"
-    return Gaussians.of(splat_ply.read_splats(path, tell)), "2dgs"  # raises for other kinds
+        return read_gaussians(path, warn), "3dgs (three scales, for viewers)"
+    return Gaussians.of(splat_ply.read_splats(path, warn)), "2dgs"  # raises for other kinds
 
 
 def reader_of(path: str | os.PathLike[str]) -> SplatReader | None:
@@ -241,7 +241,7 @@ def reader_of(path: str | os.PathLike[str]) -> SplatReader | None:
 
 
 def is_splat_file(path: str | os.PathLike[str]) -> bool:
-    """Whether the name of a file is that of a splat format other than PLY."""
+    """Return whether the name of a file is that of a splat format other than PLY."""
     return reader_of(path) is not None
 
 
@@ -259,7 +259,7 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
     return SplatFile(kind, gaussians, gaussians.disks() if flat else None, tuple(dict.fromkeys(notes)))
 
 
-def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Splats:
+def read_splats(path: str | os.PathLike[str], tell: Warn = warnings.warn) -> Splats:
     """Read flat splats from a file of any format that gs2d writes.
 
     Parameters
@@ -293,12 +293,12 @@ def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Spl
     return file.gaussians.to_surfels(path) if file.surfels is None else file.surfels
 
 
-def read_surfels(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Splats, str]:
-    """Read splats to start a training from, and describe them.
+def read_surfels(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> tuple[Splats, str]:
+    """Return splats for the start of a training, and a description of them.
 
     3D Gaussians lose their smallest scale, whose axis becomes the normal
-    (:meth:`gs2d.io.gaussians.Gaussians.flattened`). ``tell`` is as in ``read_splats``. Raises DataError if the file is
-    missing, broken, or contains no splats.
+    (:meth:`gs2d.io.gaussians.Gaussians.flattened`). ``warn`` receives messages about dropped content. Raises DataError
+    if the file is missing, broken, or contains no splats.
     """
     other = {"mesh": "a mesh", "points": "a point cloud"}.get("" if is_splat_file(path) else ply_kind(path))
     if other is not None:
@@ -308,7 +308,7 @@ def read_surfels(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tu
         )
     file = read_splat_file(path)
     for note in file.notes:
-        tell(note)
+        warn(note)
     if len(file.gaussians) == 0:
         raise DataError(f"{os.fspath(path)} must contain splats, got an empty file; use another file")
     if file.surfels is not None:
@@ -327,18 +327,18 @@ def _mended(gaussians: Gaussians) -> Gaussians:
     )
 
 
-def _finite(gaussians: Gaussians, path: str | os.PathLike[str], tell: Tell) -> Gaussians:
-    """Drop Gaussians with NaN or infinity; ``tell`` receives a message about them."""
+def _finite(gaussians: Gaussians, path: str | os.PathLike[str], warn: Warn) -> Gaussians:
+    """Drop Gaussians with NaN or infinity; ``warn`` receives a message about them."""
     finite = {}
     for field in fields(gaussians):
         values = getattr(gaussians, field.name)
         finite[field.name] = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-    kept = np.logical_and.reduce(list(finite.values()))
-    if kept.all():
+    keep = np.logical_and.reduce(list(finite.values()))
+    if keep.all():
         return gaussians
-    count, among = int((~kept).sum()), ", ".join(name for name, rows in finite.items() if not rows.all())
-    got = f"{count:,} of {len(gaussians):,} splats have NaN or infinity ({among})"
-    if not kept.any():
-        raise DataError(f"{os.fspath(path)}: expected finite numbers, but {got}; export the file again")
-    tell(f"{Path(path).name}: {got} and were dropped")
-    return gaussians.rows(kept)
+    count, among = int((~keep).sum()), ", ".join(name for name, rows in finite.items() if not rows.all())
+    problem = f"{count:,} of {len(gaussians):,} splats have NaN or infinity ({among})"
+    if not keep.any():
+        raise DataError(f"{os.fspath(path)}: expected finite numbers, but {problem}; export the file again")
+    warn(f"{Path(path).name}: {problem} and were dropped")
+    return gaussians.rows(keep)

@@ -46,19 +46,19 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score the splats of a run, and its mesh if there is a true surface; update metrics, verdict and report."""
 
-    def report(text: str) -> None:
+    def notify(text: str) -> None:
         on_event(Notice(text))
 
     check_thresholds(options.thresholds)
     comparisons = options.matched
     path, named = Path(path), options.ground_truth
-    truth = None if named is None or named.is_dir() else choose_truth(named, named.parent, report)
+    truth = None if named is None or named.is_dir() else choose_truth(named, named.parent, notify)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, trained = open_finished(path, threads, on_event)
     lpips = None if lpips is None else lpips.to(trained.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
     if truth is None and trained.scene.root is not None:
-        truth = choose_truth(named, trained.scene.root, report)
+        truth = choose_truth(named, trained.scene.root, notify)
     has_mesh = run.file(MESH).exists()
     if truth is not None and not has_mesh and named is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
@@ -83,7 +83,9 @@ def evaluate_run(
     if truth is not None and has_mesh:
         mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds
         on_event(Phase("scoring the surface", 0))
-        result["surface"] = score_surface(mesh, truth, trained.scene, folder=folder, notify=report, thresholds=thresholds)
+        result["surface"] = score_surface(
+            mesh, truth, trained.scene, folder=folder, notify=notify, thresholds=thresholds
+        )
     elif truth is not None:
         on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():

@@ -24,7 +24,7 @@ from gs2d.data import Scene, View
 from gs2d.data.image_files import write_image
 from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.io.run_dir import RENDERS, RunFolder, make_folder, remove_made
+from gs2d.io.run_dir import RENDERS, RunFolder, make_folder, remove_created
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.finish.viewpoints import orbit_cameras
@@ -168,7 +168,7 @@ def render_run(
         except BaseException:  # a full disk, Ctrl-C: leave no partial set of images
             for image in written:
                 image.unlink(missing_ok=True)
-            remove_made(created)
+            remove_created(created)
             raise
         result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
         if video is None:

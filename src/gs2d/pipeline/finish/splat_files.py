@@ -8,7 +8,7 @@ from typing import Any
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError
 from gs2d.io.formats.splat_formats import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
-from gs2d.io.gaussians import Tell
+from gs2d.io.gaussians import Warn
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.prepare.loaded import checked_output, finished_splats
 
@@ -46,10 +46,10 @@ def checked_layout(path: Path, out: Path, layout: str | None = None) -> str:
     return layout
 
 
-def splats_of(path: Path, report: Tell) -> Splats:
-    """Return the splats of a finished run or of a file of flat splats; ``report`` receives notes of the reader."""
+def splats_of(path: Path, warn: Warn) -> Splats:
+    """Return the splats of a finished run or of a file of flat splats; ``warn`` receives notes of the reader."""
     if path.is_file():
-        return read_splats(path, report)
+        return read_splats(path, warn)
     run = open_run(path)
     run.sweep()
     return finished_splats(run)

@@ -18,8 +18,8 @@ from gs2d.pipeline.look.page import page_content, photograph_jpeg
 from gs2d.training.events import OnEvent, Step, ignore
 from gs2d.training.state import TrainState
 from gs2d.viewer.packed_splats import PackedSplats
-from gs2d.viewer.page_server import Answer, PageServer, Route, number_in
-from gs2d.viewer.scene_page import PageOffer, PageScene, pack_for, served_page, splats_answer
+from gs2d.viewer.page_server import PageServer, Response, Route, number_in
+from gs2d.viewer.scene_page import PageOffer, PageScene, pack_for, served_page, splats_response
 
 FINAL = "final"
 PHOTOGRAPH_SIDE = 640  # px, longer side
@@ -41,7 +41,7 @@ def open_viewer(path: Path, port: int | None = None, on_event: OnEvent = ignore)
     has_photographs = bool(content.photographs)
     page = served_page(content.scene, PageOffer(tuple(meshes), has_photographs, stages=tuple(stages)))
     routes: dict[str, Route] = {
-        "": lambda _: Answer("text/html; charset=utf-8", [page]),
+        "": lambda _: Response("text/html; charset=utf-8", [page]),
         "splats": _stages_route(stages, content.scene),
         "photograph": photographs_route(content.photographs, content.scene.settings.background),
         **meshes,
@@ -61,9 +61,9 @@ def serve(server: PageServer, on_event: OnEvent = ignore) -> None:
 def photographs_route(views: Sequence[View], background: Sequence[float]) -> Route:
     """Return the route of the photographs of the views, as small JPEG files."""
 
-    def respond(arguments: Mapping[str, str]) -> Answer:
+    def respond(arguments: Mapping[str, str]) -> Response:
         view = views[number_in(arguments, "view", len(views))]
-        return Answer("image/jpeg", [photograph_jpeg(view, background, PHOTOGRAPH_SIDE)])
+        return Response("image/jpeg", [photograph_jpeg(view, background, PHOTOGRAPH_SIDE)])
 
     return respond
 
@@ -75,12 +75,12 @@ def _stages_route(stages: Mapping[str, Callable[[], Splats]], scene: PageScene) 
     def packed(stage: str) -> PackedSplats:
         return pack_for(scene, stages[stage]())
 
-    def respond(arguments: Mapping[str, str]) -> Answer:
+    def respond(arguments: Mapping[str, str]) -> Response:
         stage = arguments.get("stage", "")
         if stage not in stages:
             raise DataError(f"stage must be one of {', '.join(stages)}, got {stage[:40]!r}")
         with lock:
-            return splats_answer(packed(stage))
+            return splats_response(packed(stage))
 
     return respond
 
@@ -92,9 +92,9 @@ def _splats_of(checkpoint: Path) -> Splats:
 def _mesh_routes(run: RunFolder) -> dict[str, Route]:
     """Return the routes of the meshes that a run has."""
 
-    def respond(name: str, _: Mapping[str, str]) -> Answer:
+    def respond(name: str, _: Mapping[str, str]) -> Response:
         mesh = read_mesh(run.file(MESH)) if name == "mesh" else read_textured(run.file(TEXTURED))
-        return Answer("application/octet-stream", [web_mesh(mesh)])
+        return Response("application/octet-stream", [web_mesh(mesh)])
 
     files = {"mesh": MESH, "textured": TEXTURED}
     return {name: partial(respond, name) for name, file in files.items() if run.file(file).exists()}

@@ -23,7 +23,7 @@ from gs2d.data import load_scene
 from gs2d.data.masks import FOLDER
 from gs2d.data.positions import Positions, matched, read_positions, to_enu
 from gs2d.errors import DataError, RunError
-from gs2d.io.run_dir import make_folder, now, remove_made, versions
+from gs2d.io.run_dir import make_folder, now, remove_created, versions
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.prepare.limits import MAX_THREADS
 from gs2d.pipeline.prepare.options import PoseEstimation, PosesOptions, check_choices, values
@@ -118,7 +118,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             put_in_place(work / STAGED, out, work)
             forget(work)
     except BaseException:
-        remove_made(created)
+        remove_created(created)
         raise
     for line in _warnings(result):
         on_event(Notice(line))

@@ -22,8 +22,8 @@ from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, StageStarted, Step, TrainingEvent
 from gs2d.training.state import TrainState
 from gs2d.viewer.packed_splats import PackedSplats
-from gs2d.viewer.page_server import Answer, PageServer
-from gs2d.viewer.scene_page import PageOffer, pack_for, served_page, splats_answer
+from gs2d.viewer.page_server import PageServer, Response
+from gs2d.viewer.scene_page import PageOffer, pack_for, served_page, splats_response
 
 WATCHED = 5.0  # s after a poll during which a page counts as open; it polls every second
 MIN_SECONDS = 2.0  # between two copies
@@ -48,7 +48,7 @@ class Live:
         self._scene = page_scene(loaded.resolved.title or loaded.scene.name, views, loaded.settings, points)
         page = served_page(self._scene, PageOffer(photographs=True, live=True))
         routes = {
-            "": lambda _: Answer("text/html; charset=utf-8", [page]),
+            "": lambda _: Response("text/html; charset=utf-8", [page]),
             "state": self._state_response,
             "splats": self._splats_response,
             "photograph": photographs_route(views, loaded.settings.background),
@@ -92,12 +92,12 @@ class Live:
         self._server.close()
 
     # -- the server's threads ------------------------------------------------------------------------------------------
-    def _state_response(self, _: Mapping[str, str]) -> Answer:
+    def _state_response(self, _: Mapping[str, str]) -> Response:
         self._polled = time.monotonic()
         state = {"version": self._version, "status": self._status}
-        return Answer("application/json", [json.dumps(state).encode()])
+        return Response("application/json", [json.dumps(state).encode()])
 
-    def _splats_response(self, _: Mapping[str, str]) -> Answer:
+    def _splats_response(self, _: Mapping[str, str]) -> Response:
         with self._lock:
             if self._copy is not None:
                 began = time.thread_time()  # not the time that it waits for a core
@@ -107,4 +107,4 @@ class Live:
                 self._copy_at = time.monotonic() + max(MIN_SECONDS, seconds / MAX_FRACTION)
             if self._packed is None:
                 raise DataError("there are no splats yet")
-            return splats_answer(self._packed)
+            return splats_response(self._packed)

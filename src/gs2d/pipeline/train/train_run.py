@@ -19,7 +19,7 @@ from gs2d.io.run_dir import (
     claim_run,
     is_run,
     make_folder,
-    remove_made,
+    remove_created,
 )
 from gs2d.pipeline.attempts import again, attempted_file
 from gs2d.pipeline.finish.run_mesh import extract_mesh, write_mesh_metrics
@@ -78,7 +78,7 @@ def train(
             nullcontext() if options.viewer is None else closing(Live(loaded, on_event)) as live,
         ):
             report = on_event if live is None else live.on_event
-            run.made += () if options.cache is None else make_folder(options.cache)
+            run.created += () if options.cache is None else make_folder(options.cache)
             if is_run(run.path):
                 check_same_run(run, loaded.resolved)
                 if run.file(EDITS).exists():
@@ -120,7 +120,7 @@ def check_places(options: TrainOptions, allowed: tuple[str, ...] = ()) -> None:
     if options.viewer is not None:
         free_port(options.viewer or None, option="--viewer")
     if options.cache is not None:  # an unusable folder fails here, not after the first stage
-        remove_made(make_folder(options.cache))
+        remove_created(make_folder(options.cache))
 
 
 @contextmanager
