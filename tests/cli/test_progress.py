@@ -116,7 +116,7 @@ def follow(seconds: list[float]) -> Iterator[str]:
     for number, now in enumerate(seconds, start=1):
         clock.now = now
         bar.step(10 * number)
-        yield bar.left()
+        yield bar.remaining()
 
 
 def seconds_of(left: str) -> float:

@@ -133,7 +133,7 @@ def _help_or_version(argv: Sequence[str]) -> list[str] | None:
 
 
 def _for_this_process(command: Common) -> Common:
-    """Return the command for this process of several: only process 0 prints.
+    """Return the command for this process; of several processes only the first prints.
 
     Raises UsageError if the command cannot run in several processes.
     """
@@ -180,7 +180,7 @@ def _report(error: Exception, verbose: bool) -> int:
 
 
 def _report_missing(console: Console, argv: Sequence[str], command: Common) -> int:
-    """Print what a finished command could not write and the command that writes it; return the exit code."""
+    """Print missing results of a finished command and the commands that write them; return the exit code."""
     for event in console.missing:
         if command.verbose and event.error is not None:
             _print_traceback(event.error)

@@ -20,30 +20,30 @@ from rich.text import Text
 from gs2d.core.text import duration, printable
 from gs2d.training.events import Event, Notice, NotMade, Phase, StageScored, Step
 
-GREW = (2.0, 60.0)  # factor and seconds by which an estimate must exceed the shown time for the work to have grown
+GREW = (2.0, 60.0)  # factor and seconds by which an estimate must exceed the shown time to increase it
 _WIDEST, _LEAST = 32, 6  # columns of a bar; no bar with fewer
 _FULL, _EMPTY = "\u2501", "\u2500"
-LOG_SECONDS, LOG_FRACTION = 60.0, 0.02  # least time and part of a phase between two lines of a log file
+LOG_SECONDS, LOG_FRACTION = 60.0, 0.02  # minimum time and fraction of a phase between two lines of a log file
 _ANY_WIDTH = 10_000  # columns
 _NO_SCREENS = ("dumb", "unknown")  # values of TERM without cursor movement
 
 
 class Bar:
-    """Progress of a phase: name, bar, counts and time left; below it details."""
+    """Progress of a phase: name, bar, counts and remaining time; below it details."""
 
     def __init__(self, phase: Phase, clock: Callable[[], float] = time.monotonic) -> None:
         self.phase, self._clock = phase, clock
         self.done, self.detail = phase.done, ""
-        self._began, self._shown = clock(), math.inf  # time at the beginning, and shown time left, s
+        self._began, self._shown = clock(), math.inf  # time at the beginning, and shown remaining time, s
 
     def step(self, done: int, detail: str = "") -> None:
         """Count a step."""
         self.done, self.detail = done, detail
 
-    def left(self) -> str:
-        """Return the time left ("3 min left"), or the elapsed time where it is too early to estimate.
+    def remaining(self) -> str:
+        """Return the remaining time ("3 min left"), or the elapsed time while it cannot be estimated.
 
-        The time left increases only if the work grew.
+        The remaining time increases only if the estimate exceeds it by ``GREW``.
         """
         elapsed = self._clock() - self._began
         seconds = self.phase.seconds_left(self.done, elapsed)
@@ -57,7 +57,7 @@ class Bar:
     def lines(self, width: int, *, ascii_only: bool = False) -> Iterator[Text]:
         """Yield the lines, at most ``width`` columns wide."""
         counts = f"{self.done:,}/{self.phase.total:,}" if self.phase.total else ""
-        tail = "  ".join(word for word in (counts, self.left()) if word)
+        tail = "  ".join(word for word in (counts, self.remaining()) if word)
         name = _cut(self.phase.name, max(width - len(tail) - 2, 8))
         columns = min(width - len(name) - len(tail) - 4, _WIDEST)
         line = Text(name, no_wrap=True, overflow="ellipsis")
@@ -168,7 +168,7 @@ class Console:
         due = time.monotonic() - at >= LOG_SECONDS and step.done - done >= LOG_FRACTION * total
         if not self._interactive and total and due:
             self._logged = (time.monotonic(), step.done)
-            line = f"{printable(self._bar.phase.name)}: {step.done:,} of {total:,}, {self._bar.left()}"
+            line = f"{printable(self._bar.phase.name)}: {step.done:,} of {total:,}, {self._bar.remaining()}"
             self._err.print(line, markup=False, soft_wrap=True)
 
     def close(self) -> None:

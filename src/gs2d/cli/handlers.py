@@ -27,7 +27,7 @@ EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows wi
 
 # -- tables and lines --------------------------------------------------------------------------------------------------
 def show_run(run: RunFolder, console: Console, *, definition: bool = False, **extra: Any) -> None:
-    """Show the metrics of a run as a table, its files, and its verdict; all of it with ``extra`` as JSON."""
+    """Print the metrics of a run as a table, its files, and its verdict; with ``--json`` also ``extra``."""
     from gs2d.report.sections.verdict_section import read_verdict
 
     path, metrics = run.path, run.metrics()
@@ -106,7 +106,7 @@ def show_surface(surface: dict[str, Any] | None, console: Console) -> None:
 
 # -- actions -----------------------------------------------------------------------------------------------------------
 def train(command: c.TrainCommand, console: Console) -> None:
-    """``gs2d train``."""
+    """Run ``gs2d train``."""
     from gs2d.pipeline.train.train_run import train as run_training
 
     run = run_training(command, console.on_event)
@@ -115,7 +115,7 @@ def train(command: c.TrainCommand, console: Console) -> None:
 
 
 def mesh(command: c.MeshCommand, console: Console) -> None:
-    """``gs2d mesh``."""
+    """Run ``gs2d mesh``."""
     from gs2d.pipeline.finish.run_mesh import mesh_run
     from gs2d.pipeline.prepare.limits import use_memory
 
@@ -159,7 +159,7 @@ def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console
 
 
 def render(command: c.RenderCommand, console: Console) -> None:
-    """``gs2d render``."""
+    """Run ``gs2d render``."""
     from gs2d.pipeline.finish.run_images import render_run
     from gs2d.pipeline.prepare.limits import use_memory
 
@@ -186,7 +186,7 @@ def view(command: c.ViewCommand, console: Console) -> None:
 
 
 def evaluate(command: c.EvaluateCommand, console: Console) -> None:
-    """``gs2d evaluate``."""
+    """Run ``gs2d evaluate``."""
     from gs2d.pipeline.finish.evaluate import evaluate_run
     from gs2d.pipeline.prepare.limits import use_memory
 
@@ -207,7 +207,7 @@ def evaluate(command: c.EvaluateCommand, console: Console) -> None:
 
 
 def export(command: c.ExportCommand, console: Console) -> None:
-    """``gs2d export``."""
+    """Run ``gs2d export``."""
     from gs2d.pipeline.finish.splat_files import export_run
     from gs2d.pipeline.look.page import SUFFIXES, page_run
 
@@ -230,7 +230,7 @@ def export(command: c.ExportCommand, console: Console) -> None:
 
 
 def recipes(command: c.RecipesCommand, console: Console) -> None:
-    """``gs2d recipes``."""
+    """Run ``gs2d recipes``."""
     from gs2d.config.presets import RECIPES, about_recipe, get_recipe
     from gs2d.config.serialize import to_json
 
@@ -250,7 +250,7 @@ def recipes(command: c.RecipesCommand, console: Console) -> None:
 
 
 def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
-    """``gs2d reconstruct``: then the figures, the files and the next command."""
+    """Run ``gs2d reconstruct``; print metrics, files and the next command."""
     from gs2d.core.json_files import read_json
     from gs2d.pipeline.reconstruct import CAPTURE
     from gs2d.pipeline.reconstruct import reconstruct as run_all
@@ -262,7 +262,7 @@ def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
 
 
 def poses(command: c.PosesCommand, console: Console) -> None:
-    """``gs2d poses``: photographs with and without a camera, and the next command."""
+    """Run ``gs2d poses``; print photographs with and without a camera, and the next command."""
     from gs2d.pipeline.prepare.pose_finding import find_poses, lost_lines, placed_line
 
     result = find_poses(command, console.on_event)
@@ -282,18 +282,18 @@ def poses(command: c.PosesCommand, console: Console) -> None:
 
 
 def info(command: c.InfoCommand, console: Console) -> None:
-    """``gs2d info``."""
+    """Run ``gs2d info``."""
     from gs2d.pipeline.look.info import describe_capture, describe_file
 
     path: Path = command.path
     if is_run(path):
         show_run(open_run(path), console, definition=True)
         return
-    facts = describe_capture(path) if path.is_dir() else describe_file(path)
-    for name, value in facts.items():
+    description = describe_capture(path) if path.is_dir() else describe_file(path)
+    for name, value in description.items():
         for part in value if isinstance(value, list) else [value]:
             console.say(f"{name}: {part}")
-    console.result(facts)
+    console.result(description)
 
 
 # -- gs2d doctor: what this machine can run, and how to install the rest -----------------------------------------------
@@ -345,7 +345,7 @@ def _show(console: Console, name: str, available: bool, details: str, remedy: st
 
 
 def _optional() -> dict[str, dict[str, Any]]:
-    """Return what commands need beyond every installation: whether it is available, its version, how to get it."""
+    """Return optional packages and programs: whether they are available, their versions, how to install them."""
     entries = {}
     for extra, (used_by, packages) in _EXTRAS.items():
         entries[extra] = _entry(used_by, {name: _version(name) for name in packages}, install(extra))
@@ -356,9 +356,9 @@ def _optional() -> dict[str, dict[str, Any]]:
     return entries
 
 
-def _entry(used_by: str, found: dict[str, str | None], remedy: str) -> dict[str, Any]:
-    missing = [name for name, version in found.items() if version is None]
-    versions = ", ".join(f"{name} {version}" for name, version in found.items())
+def _entry(used_by: str, installed: dict[str, str | None], remedy: str) -> dict[str, Any]:
+    missing = [name for name, version in installed.items() if version is None]
+    versions = ", ".join(f"{name} {version}" for name, version in installed.items())
     details = f"{', '.join(missing)} missing" if missing else versions
     return {"used_by": used_by, "available": not missing, "details": details, "remedy": remedy if missing else ""}
 

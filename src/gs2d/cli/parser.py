@@ -20,7 +20,7 @@ HELP_WORDS = ("-h", "--help", "--help-all")
 _OVERRIDES = "overrides"  # the field of --set, where a command trains
 _ALIKE, _MOST = 0.6, 3  # smallest difflib ratio, and largest number, of proposed words
 _NUMBER = re.compile(r"-\.?\d")  # a value, not an option
-_CAPTURE = ("", "the input is given without an option")
+_CAPTURE = ("", "the input needs no option")
 _RUN = ("--out", "use --out for what the command writes")
 _SHORTER = ("--schedule-scale", "--schedule-scale 0.1 trains a tenth of the recipe's iterations")
 _SMALLER = ("--downscale", "--downscale 2 halves the photographs")
@@ -66,7 +66,7 @@ def parse(argv: Sequence[str]) -> Common:
     except UsageError as error:
         raise UsageError(_with_help(str(error), f"gs2d {name} --help")) from None
     if isinstance(command, HowItRuns) and command.resume and command.overwrite:
-        raise UsageError("--resume and --overwrite exclude each other; give one")
+        raise UsageError("--resume and --overwrite exclude each other; use one")
     return command
 
 
@@ -103,8 +103,8 @@ def _settings(changes: Sequence[str], options: Sequence[Option], trains: bool) -
         elif trains:
             values.setdefault(_OVERRIDES, []).append(change)
         else:
-            known = f"--set NAME=VALUE takes {', '.join(settings)}"
-            raise UsageError(f"{known}; got {change!r}{_meant(name, settings)}")
+            usage = f"--set NAME=VALUE takes {', '.join(settings)}"
+            raise UsageError(f"{usage}; got {change!r}{_meant(name, settings)}")
     return values
 
 
@@ -159,9 +159,9 @@ def _no_command(name: str, words: Sequence[str]) -> str:
 
 def _no_option(name: str, flag: str, options: Sequence[Option]) -> str:
     """Return the message for an unknown option: a similar one, or the commands that have it."""
-    known = [word for option in options for word in option.flags]
+    flags = [word for option in options for word in option.flags]
     here, advice = _ELSEWHERE.get(flag, ("", ""))
-    if here in known or (advice and not here):
+    if here in flags or (advice and not here):
         return f"gs2d {name} has no option {flag}; {advice}"
     setting = next((o for o in options if o.mark.setting and o.field == flag.strip("-").replace("-", "_")), None)
     if setting is not None:
@@ -173,14 +173,14 @@ def _no_option(name: str, flag: str, options: Sequence[Option]) -> str:
     ]
     if others:
         return f"gs2d {name} has no option {flag}; {_listed(others, 'and')} {'has' if len(others) == 1 else 'have'} one"
-    begun = sorted((other for other in known if other.startswith(flag)), key=len)[:_MOST]
-    meant = f"; did you mean {_listed(begun, 'or')}?" if begun else _meant(flag, known)
+    begun = sorted((other for other in flags if other.startswith(flag)), key=len)[:_MOST]
+    meant = f"; did you mean {_listed(begun, 'or')}?" if begun else _meant(flag, flags)
     return f"gs2d {name} has no option {flag}{meant}"
 
 
-def _meant(word: str, known: Iterable[str], before: str = "") -> str:
+def _meant(word: str, candidates: Iterable[str], before: str = "") -> str:
     """Return "; did you mean ...?" with the most similar names, or nothing."""
-    plain = {name.lstrip("-"): name for name in known}
+    plain = {name.lstrip("-"): name for name in candidates}
     close = [plain[name] for name in difflib.get_close_matches(word.lstrip("-"), list(plain), n=2, cutoff=_ALIKE)]
     names = [f"`{before}{name}`" if before else name for name in close]
     return f"; did you mean {_listed(names, 'or')}?" if names else ""

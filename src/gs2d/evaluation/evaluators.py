@@ -29,7 +29,7 @@ class Evaluator(Protocol):
     def find(self, capture: Path, ground_truth: Path | None, notify: Notify) -> Any | None:
         """Return the ground truth of a capture, or None if this evaluator has none for it.
 
-        ``ground_truth`` is the file or folder that the user requested; without it, the truth may be beside the capture.
+        ``ground_truth`` is the file or folder of the user; None: the truth may be beside the capture.
         ``notify`` receives a message about each missing file. An incomplete folder is a DataError.
         """
 

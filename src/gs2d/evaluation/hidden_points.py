@@ -1,4 +1,4 @@
-"""Detect floaters without ground truth: sparse points that an image shows but its rendering occludes.
+"""Detect floaters without ground truth: sparse points that are visible in an image but occluded in its rendering.
 
 A point that structure from motion triangulated from an image is visible in it. If the rendered median depth is clearly
 smaller, the splats form floaters between camera and surface.
@@ -10,7 +10,7 @@ import numpy as np
 
 from gs2d.data.prior_maps import PointsInView
 
-NEARER = 0.95  # of a point's depth: a nearer surface occludes it; SfM depths have errors of a few percent
+NEARER = 0.95  # fraction of a point's depth; a nearer surface occludes it. SfM depths have errors of a few per cent
 
 
 def hidden_points(depth: np.ndarray, points: PointsInView) -> np.ndarray:

@@ -30,7 +30,7 @@ SCALE = (0.458, 0.448, 0.450)
 MIN_SIZE = 16  # px; four poolings reduce it to one
 REMEDY = (
     "pass --lpips-weights with torchvision's vgg16-397923af.pth and the lpips package's weights/v0.1/vgg.pth, "
-    "or the folder that holds both"
+    "or the folder of both"
 )
 
 
@@ -140,7 +140,7 @@ def load_lpips(paths: str | Path | Iterable[str | Path]) -> Lpips:
     for key, shape in expected.items():
         if key not in weights:
             where = ", ".join(map(str, files)) or f"no .pth file in {', '.join(map(str, sources))}"
-            raise DataError(f"LPIPS weights lack {key} (in {where}); {REMEDY}")
+            raise DataError(f"LPIPS weights have no {key} (in {where}); {REMEDY}")
         if tuple(weights[key].shape) != shape:
             raise DataError(f"LPIPS weight {key} must be {list(shape)}, got {list(weights[key].shape)}; {REMEDY}")
     return Lpips(weights)

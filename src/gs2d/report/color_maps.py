@@ -8,7 +8,7 @@ from gs2d.core.checks import check_shapes
 
 ERROR_TOP = 0.2  # mean absolute error at the end of the scale, for colours in [0, 1]
 HIGHLIGHT = (0.93, 0.11, 0.62)  # colour of high-error splats
-HATCH, HATCHED = 6, (0.9, 0.9, 0.92)  # width of the stripes of unknown pixels in px, and the lighter colour
+HATCH, HATCHED = 6, (0.9, 0.9, 0.92)  # width of the stripes of invalid pixels in px, and the lighter colour
 IGNORED = (0.82, 0.82, 0.84)  # colour of masked pixels
 
 _ERROR_SCALE = np.array(
@@ -20,7 +20,7 @@ _DEPTH_SCALE = np.array(
 
 
 def _scale(anchors: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Colours [..., 3] at positions ``t`` in [0, 1] (clipped) on a piecewise linear scale."""
+    """Return colours [..., 3] at positions ``t`` in [0, 1] (clipped) on a piecewise linear scale."""
     position = np.clip(t, 0.0, 1.0)
     knots = np.linspace(0.0, 1.0, len(anchors))
     return np.stack([np.interp(position, knots, anchors[:, k]) for k in range(3)], axis=-1).astype(np.float32)

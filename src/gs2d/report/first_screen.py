@@ -19,18 +19,18 @@ from gs2d.report.sections.verdict_section import read_verdict
 def first_screen(run: RunRecord, guard: Guard) -> str:
     """Return the first screen; a part that fails is replaced by its error."""
     verdict = guard("verdict", lambda: read_verdict(run.path))
-    found = guard("gallery", lambda: read_gallery(run.path / RENDERS))
-    gallery = found if isinstance(found, Gallery) else None
+    loaded = guard("gallery", lambda: read_gallery(run.path / RENDERS))
+    gallery = loaded if isinstance(loaded, Gallery) else None
     cameras = [] if gallery is None else [view.camera for view in gallery.views]
-    pair = found if isinstance(found, str) else guard("comparison with a photograph", lambda: _pair(gallery))
+    pair = loaded if isinstance(loaded, str) else guard("comparison with a photograph", lambda: _pair(gallery))
     mesh = guard("view of the mesh", lambda: mesh_view(run.path, cameras))
-    known = verdict if isinstance(verdict, Mapping) else {}
+    fields = verdict if isinstance(verdict, Mapping) else {}
     return render(
         "first_screen.html",
         title=run.title,
-        grade=known.get("grade"),
-        sentence=verdict if isinstance(verdict, str) else _sentence(run, known),
-        advice=next((str(entry["advice"]) for entry in known.get("findings", ()) if entry.get("advice")), ""),
+        grade=fields.get("grade"),
+        sentence=verdict if isinstance(verdict, str) else _sentence(run, fields),
+        advice=next((str(entry["advice"]) for entry in fields.get("findings", ()) if entry.get("advice")), ""),
         pair=pair if isinstance(pair, Pair) else None,
         no_pair=pair if isinstance(pair, str) else None,
         mesh=mesh if isinstance(mesh, MeshView) else None,
@@ -48,27 +48,27 @@ def _sentence(run: RunRecord, verdict: Mapping[str, Any]) -> str:
 
 
 def _pair(gallery: Gallery | None) -> Pair | str:
-    """Return the first view beside its photograph, or why there is none."""
+    """Return the first view beside its photograph, or the reason why there is none."""
     pair = compared(gallery, gallery.views[0], width=1000) if gallery is not None and gallery.views else None
     return "There is no rendering yet. `gs2d render RUN` writes some." if pair is None else pair
 
 
 def _numbers(run: RunRecord) -> list[tuple[str, str]]:
-    """Return three figures with what they measure; those that the run does not have are left out."""
-    found = []
+    """Return up to three figures of the run with their names."""
+    figures = []
     psnr, splats = number((run.last.get(run.split) or {}).get("psnr")), number(run.last.get("splats"))
     if psnr is not None:
-        found.append((f"{psnr:.1f} dB", "PSNR on new views" if run.split == "test" else "PSNR on training views"))
+        figures.append((f"{psnr:.1f} dB", "PSNR on new views" if run.split == "test" else "PSNR on training views"))
     if splats is not None:
         size = number(run.last.get("bytes"))
-        found.append((f"{splats:,.0f}", "splats" + ("" if size is None else f", {size / 1e6:.1f} MB")))
+        figures.append((f"{splats:,.0f}", "splats" + ("" if size is None else f", {size / 1e6:.1f} MB")))
     seconds = [number(stage.get("seconds")) for stage in run.stages]
     if seconds and all(value is not None for value in seconds):
-        found.append((duration(sum(value or 0.0 for value in seconds)), "training"))
-    return found
+        figures.append((duration(sum(value or 0.0 for value in seconds)), "training"))
+    return figures
 
 
 def _next_command(run: RunRecord) -> str:
-    """Return the command that most people run next."""
+    """Return the most likely next command."""
     path = shlex.quote(str(run.path))
     return f"gs2d view {path}" if (run.path / MESH).is_file() else f"gs2d mesh {path}"

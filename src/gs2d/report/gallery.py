@@ -36,7 +36,7 @@ class ShownView:
 
 @dataclass(frozen=True)
 class Gallery:
-    """The views and stages that ``renders/`` holds."""
+    """The views and stages in ``renders/``."""
 
     folder: Path
     views: tuple[ShownView, ...]

@@ -37,7 +37,7 @@ class Pair:
 
     @property
     def ratio(self) -> float:
-        """Width over height."""
+        """Return width over height."""
         return self.images[0].shape[1] / self.images[0].shape[0]
 
 
@@ -68,12 +68,12 @@ def environment() -> jinja2.Environment:
 
 
 def page(title: str, body: Sequence[str]) -> str:
-    """Return a self-contained document whose body consists of the given HTML."""
+    """Return a self-contained document with the HTML parts of ``body``."""
     return environment().get_template("page.html").render(title=title, body=[Markup(part) for part in body])
 
 
 def missing(text: str) -> Markup:
-    """Return a box that says what is missing."""
+    """Return a box with a text about missing content."""
     return macro("macros.html", "missing", text)
 
 

@@ -1,4 +1,4 @@
-"""Makes the parts of the report one by one, so that a part that fails does not lose the others."""
+"""Build the parts of the report separately, so that the failure of one does not affect the others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OnFailure = Callable[[str, Exception], None]
 
 @dataclass(frozen=True)
 class Guard:
-    """Makes parts of a page; ``on_failure`` receives those that fail."""
+    """Builds parts of a page; ``on_failure`` receives those that fail."""
 
     on_failure: OnFailure | None
 

@@ -1,7 +1,6 @@
 """``report.html``: the result of a run in one file that opens offline.
 
-The first screen shows whether it worked and how it looks; the sections below it are folded. Everything is read from the
-run folder.
+The first screen shows verdict and images; the sections below it are folded. Everything is read from the run folder.
 """
 
 from __future__ import annotations
@@ -36,16 +35,16 @@ def write_report(run: Path, *, on_failure: OnFailure | None = None) -> Path:
 
 
 def _sections(record: RunRecord, guard: Guard) -> list[str]:
-    """Return the sections that have something to show, folded."""
-    made: list[str] = []
+    """Return the sections that are not empty, folded."""
+    folded: list[str] = []
     for name, section in SECTIONS.working():
         html = guard(f"section {name}", partial(_html, section, record))
         if html:
             shown = html if isinstance(html, Markup) else missing(html)
-            made.append(macro("macros.html", "folded", name, getattr(section, "title", name), shown))
-    return made
+            folded.append(macro("macros.html", "folded", name, getattr(section, "title", name), shown))
+    return folded
 
 
 def _html(section: Section, record: RunRecord) -> Markup:
-    """Return the HTML of a section; empty where it has nothing to show."""
+    """Return the HTML of a section; may be empty."""
     return Markup(section(record) or "")

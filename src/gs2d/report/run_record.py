@@ -16,7 +16,7 @@ from gs2d.io.run_dir import open_run
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run, as the sections of its report read it."""
+    """The data of a run for the sections of its report."""
 
     path: Path  # the run folder
     definition: dict[str, Any]  # ``run.json``
@@ -53,7 +53,7 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read what the report needs of a run folder.
+    """Read the data of a run folder for its report.
 
     Raise RunError if the folder is not a run, DataError if a file is not JSON.
     """
@@ -70,7 +70,7 @@ def read_record(folder: Path) -> RunRecord:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn errors about the content of a file into one DataError that names the file."""
+    """Convert errors about the content of a file to a DataError that names the file."""
     try:
         yield
     except DataError:

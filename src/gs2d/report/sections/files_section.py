@@ -23,10 +23,10 @@ FILES = {  # the most useful first
 @register_section("files", title="Files")
 def files_section(run: RunRecord) -> str | None:
     """Return links to the files that exist."""
-    found = [(name, words, run.path / name) for name, words in FILES.items() if (run.path / name).is_file()]
-    if not found:
+    files = [(name, words, run.path / name) for name, words in FILES.items() if (run.path / name).is_file()]
+    if not files:
         return None
-    return macro("lists.html", "files", [(name, words, size_text(path.stat().st_size)) for name, words, path in found])
+    return macro("lists.html", "files", [(name, words, size_text(path.stat().st_size)) for name, words, path in files])
 
 
 def size_text(count: int) -> str:

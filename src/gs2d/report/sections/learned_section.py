@@ -1,4 +1,4 @@
-"""Learned quantities of photographs and cameras: what each one reports, with a plot by photograph."""
+"""Learned quantities of photographs and cameras: their reports, with a plot by photograph."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def learned_section(run: RunRecord) -> str | None:
     record: dict[str, Any] = {"views": {}, "frames": []}
     for file in filter(lambda file: (run.path / file).is_file(), (LEARNED, POSES)):
         with reading(run.path / file):
-            found = read_json(run.path / file)
-            record |= {key: found[key] for key in record.keys() & found.keys()}
+            data = read_json(run.path / file)
+            record |= {key: data[key] for key in record.keys() & data.keys()}
     parts = [_part(run, name, record) for name in map(name_of, run.recipe.get("learned") or ())]
     return Markup("\n").join(filter(None, parts)) if any(parts) else None
 
@@ -34,8 +34,8 @@ def _part(run: RunRecord, name: str, record: Mapping[str, Any]) -> Markup | None
         return render("learned.html", title=name, text=text, plot=None)
     quantity = QUANTITIES.get(name)
     with reading(run.path / LEARNED):
-        found = quantity.report(name, record)
-    if found is None:
+        result = quantity.report(name, record)
+    if result is None:
         return None
-    plot = lines_by_image(found.curves) if found.curves else None
-    return render("learned.html", title=quantity.title or name, text=found.text, plot=plot)
+    plot = lines_by_image(result.curves) if result.curves else None
+    return render("learned.html", title=quantity.title or name, text=result.text, plot=plot)

@@ -39,11 +39,11 @@ def results_section(run: RunRecord) -> str | None:
     for split, words in _SPLITS.items():
         for key, label, digits, sign in _METRICS:
             values = [number((stage.get(split) or {}).get(key)) for stage in run.stages]
-            known = [sign * value for value in values if value is not None]
-            if not known:
+            signed = [sign * value for value in values if value is not None]
+            if not signed:
                 continue
-            if len(known) > 1:
-                best += [(len(rows), 1 + k) for k, value in enumerate(values) if value == sign * max(known)]
+            if len(signed) > 1:
+                best += [(len(rows), 1 + k) for k, value in enumerate(values) if value == sign * max(signed)]
             rows.append([f"{label} ({words})", *(figure(value, digits) for value in values)])
     for label, digits, cost in _COSTS:
         values = [cost(stage) for stage in run.stages]
@@ -70,8 +70,8 @@ def figure(value: float | None, digits: int) -> str:
 
 
 def _scaled(value: Any, factor: float) -> float | None:
-    known = number(value)
-    return None if known is None else known * factor
+    amount = number(value)
+    return None if amount is None else amount * factor
 
 
 def _stage_name(stage: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from gs2d.errors import RunError
 from gs2d.report.run_record import RunRecord
 
 Section = Callable[[RunRecord], str | None]
-"""Returns the HTML of a section, or None where it has nothing to show; its attribute `title` is the heading."""
+"""Returns the HTML of a section, or None if it is empty; its attribute `title` is the heading."""
 
 _BUILTIN = (  # in the order of the page; each is a module of this package
     *("verdict", "results", "views", "training", "capture"),
@@ -30,7 +30,7 @@ def register_section(name: str, *, title: str) -> Callable[[Section], Section]:
     Parameters
     ----------
     name : str
-        Name of the section; must not be taken.
+        Name of the section; must be unique.
     title : str
         Heading.
 

@@ -14,10 +14,10 @@ from gs2d.report.sections.section_registry import register_section
 @register_section("settings", title="Settings")
 def settings_section(run: RunRecord) -> str | None:
     """Return the main settings of the run; all of them are in ``run.json``."""
-    return macro("macros.html", "facts", [*_facts(run.definition), *_subject_facts(run)])
+    return macro("macros.html", "definitions", [*_settings(run.definition), *_subject(run)])
 
 
-def _subject_facts(run: RunRecord) -> list[tuple[str, str]]:
+def _subject(run: RunRecord) -> list[tuple[str, str]]:
     """Return the subject and its box as an option."""
     subject = read_subject(run.path)
     if subject is None:
@@ -26,8 +26,8 @@ def _subject_facts(run: RunRecord) -> list[tuple[str, str]]:
     return [("Subject", f"{subject.kind}: {subject.why}"), ("Subject box", f"--subject-box {box}")]
 
 
-def _facts(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return names and values; what ``run.json`` does not have is left out."""
+def _settings(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return names and values of the settings in ``run.json``."""
     scene, backend = definition["scene"], definition.get("backend")
     pairs = [(name.capitalize(), name_of(definition[name])) for name in ("recipe", "protocol") if name in definition]
     pairs.append(("Capture", f"{scene['name']} ({scene['format']})"))

@@ -12,7 +12,7 @@ from gs2d.report.sections.section_registry import register_section
 
 @register_section("training", title="Training curves")
 def training_section(run: RunRecord) -> str | None:
-    """Return the curves that ``events.jsonl`` has."""
+    """Return the curves of ``events.jsonl``."""
     scores = {stage["name"]: number((stage.get(run.split) or {}).get("psnr")) for stage in run.stages}
     ends = {name: float(psnr) for name, psnr in scores.items() if psnr is not None and math.isfinite(psnr)}
     drawn = curves(read_history(run.events), ends, run.split)

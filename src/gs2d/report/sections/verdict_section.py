@@ -1,4 +1,4 @@
-"""The measures behind the verdict, and advice."""
+"""The measures of the verdict, and advice."""
 
 from __future__ import annotations
 

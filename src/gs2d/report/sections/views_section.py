@@ -31,7 +31,7 @@ def views_section(run: RunRecord) -> str | None:
     return render(
         "views.html",
         views=shown,
-        left=max(len(gallery.views) - MAX_VIEWS, 0),
+        hidden=max(len(gallery.views) - MAX_VIEWS, 0),
         kinds={image["kind"] for view in shown for image in view["images"]},
         scales={"error": error_scale(9), "depth": depth_scale(9)},
         top=f"{ERROR_TOP:g}",
