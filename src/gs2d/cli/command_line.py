@@ -90,7 +90,7 @@ class Option:
         )
 
     def read(self, text: str) -> Any:
-        """Return the value of a setting. Raises ValueError if the text is no valid value; says what is expected."""
+        """Return the value of a setting. Raises ValueError, with the valid values, if the text is invalid."""
         words = text.split(",") if self.count != 1 else [text]
         try:
             values = tuple(_SWITCH[word] if self.kind is bool else self.kind(word) for word in words)

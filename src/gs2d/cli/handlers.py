@@ -296,7 +296,7 @@ def info(command: c.InfoCommand, console: Console) -> None:
     console.result(description)
 
 
-# -- gs2d doctor: what this machine can run, and how to install the rest -----------------------------------------------
+# -- gs2d doctor: available backends and packages, and how to install others -------------------------------------------
 _EXTRAS = {  # extra -> (the commands that need it, its packages)
     "sfm": ("cameras of photographs (gs2d reconstruct, poses)", ("pycolmap",)),
     "geo": ("maps (gs2d survey --gps, --orthophoto)", ("pyproj", "tifffile")),

@@ -130,7 +130,7 @@ def check_inputs(command: Common) -> None:
         if not isinstance(path, Path) or option.field in _OUTPUTS:
             continue
         if option.field == "photos" and getattr(command, "resume", False):
-            continue  # not needed once the cameras are known
+            continue  # not needed after the cameras are estimated
         try:
             path.stat()
         except (FileNotFoundError, NotADirectoryError):

@@ -66,7 +66,7 @@ def register_evaluator(name: str) -> Callable[[Register], Register]:
 class SurfaceTruth:
     """A ground truth, and its evaluator."""
 
-    name: str  # of the evaluator
+    name: str  # name of the evaluator
     evaluator: Evaluator
     truth: Any  # from ``evaluator.find``
 

@@ -33,8 +33,8 @@ class ImageMetrics:
 
     psnr: Metric  # dB, of the image quantised to 8 bits (official evaluation)
     ssim: Metric  # in [-1, 1], of the same
-    psnr_float: Metric  # of the float image
-    ssim_float: Metric  # of the float image
+    psnr_float: Metric  # PSNR of the float image
+    ssim_float: Metric  # SSIM of the float image
     lpips: Metric  # VGG LPIPS of the 8-bit image scaled to [0, 1] (as 3DGS and 2DGS report)
     lpips_signed: Metric  # VGG LPIPS of the 8-bit image scaled to [-1, 1] (convention of its authors)
 

@@ -25,7 +25,7 @@ from gs2d.errors import DataError, ShapeError
 CONVENTIONS = ("0..1", "-1..1")
 BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # convolutions in torchvision's `features`
 WIDTHS = (64, 128, 256, 512, 512)
-SHIFT = (-0.030, -0.088, -0.188)  # of the LPIPS scaling layer, for [-1, 1]
+SHIFT = (-0.030, -0.088, -0.188)  # shift and scale of the LPIPS scaling layer, for [-1, 1]
 SCALE = (0.458, 0.448, 0.450)
 MIN_SIZE = 16  # px; four poolings reduce it to one
 REMEDY = (
@@ -140,7 +140,7 @@ def load_lpips(paths: str | Path | Iterable[str | Path]) -> Lpips:
     for key, shape in expected.items():
         if key not in weights:
             where = ", ".join(map(str, files)) or f"no .pth file in {', '.join(map(str, sources))}"
-            raise DataError(f"LPIPS weights have no {key} (in {where}); {REMEDY}")
+            raise DataError(f"LPIPS weights lack {key} (in {where}); {REMEDY}")
         if tuple(weights[key].shape) != shape:
             raise DataError(f"LPIPS weight {key} must be {list(shape)}, got {list(weights[key].shape)}; {REMEDY}")
     return Lpips(weights)

@@ -27,7 +27,7 @@ from gs2d.io.ply_format import PlyElement, PlyList, read_ply, write_ply
 
 COLORS = ("red", "green", "blue")
 FOREIGN = (".obj", ".stl", ".off")  # read by trimesh
-SUFFIXES = (".glb", ".obj")  # of textured meshes
+SUFFIXES = (".glb", ".obj")  # suffixes of textured meshes
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON", "BIN\0"
 _FLOAT, _UINT, _USHORT = 5126, 5125, 5123  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER

@@ -395,7 +395,7 @@ def load_tensors(path: Path) -> dict[str, Any]:
             damaged = archive.testzip()
         if damaged is not None:
             raise ValueError(f"the checksum of {damaged} is wrong")
-        with warnings.catch_warnings():  # of torch, about a damaged header
+        with warnings.catch_warnings():  # torch warns about a damaged header
             warnings.simplefilter("ignore")
             return dict(torch.load(path, map_location="cpu", weights_only=True))
     except (*_UNREADABLE, DataError, pickle.UnpicklingError) as error:

@@ -60,7 +60,7 @@ _KINDS: dict[type, str] = {
 def check_shape(path: Path, value: Any, shape: Shape, remedy: str) -> None:
     """Check a value against a shape.
 
-    Raises RunError for the first mismatch; with the file, the path of the value in it, and what was expected.
+    Raises RunError for the first mismatch, with the file, the path of the value in it, and the expected type.
     """
     try:
         _check(value, shape, "")

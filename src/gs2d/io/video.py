@@ -21,7 +21,7 @@ from gs2d.errors import BackendError, DataError
 
 SUFFIXES = (".mp4", ".webp")
 QUALITY = 18  # constant rate factor of x264, 0 (best) to 51: no visible loss
-WEBP_QUALITY = 75  # of Pillow, 0 to 100
+WEBP_QUALITY = 75  # Pillow's quality, 0 to 100
 # yuv420p with 8 bits is supported by every player. It requires even sides. The transfer function of sRGB is close to
 # BT.709; the matrix is stated, because players assume another one for small videos.
 _FILTERS = "crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"

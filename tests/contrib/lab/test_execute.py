@@ -50,7 +50,7 @@ def test_a_job_that_fails_does_not_stop_the_rest_and_is_tried_again_by_the_next_
     assert failures(jobs) == {}
 
 
-def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_its_run_is_gone(
+def test_a_finished_job_is_scored_again_for_more_scores_and_done_again_when_its_run_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
@@ -61,18 +61,18 @@ def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_
         (job.train.out / "splats.ply").touch()
         return {}
 
-    def run_that_wants(*wanted: str) -> None:
-        execute([replace(job, wanted=wanted) for job in make_jobs(tmp_path, {"a": ("1",)})], tmp_path)
+    def run_with(*scores: str) -> None:
+        execute([replace(job, scores=scores) for job in make_jobs(tmp_path, {"a": ("1",)})], tmp_path)
 
     monkeypatch.setattr(task_module, "train_and_evaluate", train)
-    run_that_wants("surface: x")
-    run_that_wants("surface: x")
-    run_that_wants()  # less is wanted: what is there stays
+    run_with("surface: x")
+    run_with("surface: x")
+    run_with()  # fewer scores: nothing is run again
     assert len(done) == 1
-    run_that_wants("surface: x", "lpips: y")
+    run_with("surface: x", "lpips: y")
     assert len(done) == 2
     (tmp_path / "runs" / "a" / "splats.ply").unlink()
-    run_that_wants("surface: x")
+    run_with("surface: x")
     assert len(done) == 3
 
 

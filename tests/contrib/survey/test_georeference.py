@@ -201,7 +201,7 @@ def test_a_known_distance_and_up(run: Path) -> None:
         (["--control", "control.csv"], "has no photograph of that name|no photograph of"),
         (["--markers", "0"], "positive number"),
         (["--set", "up=0,0,0", "--gps"], "up must be a direction"),
-        (["--set", "resolution=1"], "belongs to --orthophoto"),
+        (["--set", "resolution=1"], "needs --orthophoto"),
     ],
 )
 def test_bad_input_is_one_line(

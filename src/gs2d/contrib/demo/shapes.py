@@ -18,7 +18,7 @@ class Patch:
     vertices: np.ndarray  # [P, 3] world units
     normals: np.ndarray  # [P, 3] unit, outwards
     uvs: np.ndarray  # [P, 2]
-    faces: np.ndarray  # [F, 3] int64, counter-clockwise seen from outside
+    faces: np.ndarray  # [F, 3] int64, counter-clockwise from outside
 
     def moved(self, *, offset: Sequence[float] | np.ndarray = (0, 0, 0), turn: float = 0.0) -> Patch:
         """Return the patch rotated about z by ``turn`` radians, then translated by ``offset`` world units."""

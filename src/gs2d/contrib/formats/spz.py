@@ -46,7 +46,7 @@ _QUARTER = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 _FINEST = 20  # fractional bits
 _STEPS = 64  # steps of a position per size of a typical splat
 _COLOR = 0.15  # scale of SH colours; leaves room beyond black and white
-_SH1_STEP, _SH_STEP = 2, 4  # of 255: 7 bits for degree 1, 6 for higher ones; Niantic's library uses 5 and 4
+_SH1_STEP, _SH_STEP = 2, 4  # steps of 255: 7 bits for degree 1, 6 for higher ones; Niantic's library uses 5 and 4
 _ROOT = np.sqrt(0.5)  # bound of all quaternion components but the largest
 _WORDS = (1 << 9) - 1
 
@@ -61,7 +61,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: in
     farthest = float(np.abs(g.means).max()) if len(g) else 0.0
     bits = _fractional_bits(g, farthest)
     if farthest > _LARGEST:
-        raise DataError(f"SPZ stores positions up to {_LARGEST} units, got {farthest:.4g}; use --format 3dgs")
+        raise DataError(f"SPZ holds positions up to {_LARGEST} units, got {farthest:.4g}; use --format 3dgs")
     streams = [array.tobytes() for array in _streams(g, bits)]
     parts = _parts_4(g, bits, streams) if version == 4 else _parts_3(g, bits, streams)
     with atomic_write(path) as file:

@@ -142,7 +142,7 @@ class Results:
 
 
 def measured_on(cell: Cell, metric: str) -> str:
-    """Return what figures of one mean share: the split of the views, or protocol and unit of surfaces."""
+    """Return the split of the views, or protocol and unit of a surface; figures of one mean have the same."""
     if metric in IMAGES:
         return f"{cell.details.get('views', 'test')} views"
     if metric not in ("fscore", "chamfer"):

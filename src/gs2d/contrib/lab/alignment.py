@@ -132,7 +132,7 @@ class RobustFit:
 
     T_target_source: np.ndarray  # [4, 4]
     inliers: np.ndarray  # [P] bool: pairs closer than the threshold
-    rms: float  # of the distances of the inliers, target units
+    rms: float  # rms distance of the inliers, target units
     worst: float  # largest of these distances
 
     @property
@@ -160,7 +160,7 @@ def ransac_similarity(
     check_shapes({"source": (source, "P 3"), "target": (target, "P 3")})
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     count = len(source)
-    whole = umeyama(source, target)  # raises for what cannot be aligned at all
+    whole = umeyama(source, target)  # raises if no alignment is possible
     best = _pair_distances(whole, source, target) < threshold
     sample = min(sample, count)
     rng = np.random.default_rng(seed)

@@ -47,7 +47,7 @@ from gs2d.training.events import Notice, OnEvent, ignore
 
 BLOCKS_JSON = "blocks.json"  # in the run folder: the definition of the blocks
 COARSE, PARTITION, MERGE, FINISH = "coarse", "partition", "merge", "finish"
-RETRIES = 2  # of killed tasks, which may have run out of memory
+RETRIES = 2  # restarts of killed tasks, which may have run out of memory
 
 
 # -- tasks -------------------------------------------------------------------------------------------------------------
@@ -55,7 +55,7 @@ RETRIES = 2  # of killed tasks, which may have run out of memory
 class BlocksTask(Task):
     """A task of a training in blocks."""
 
-    options: TrainOptions  # of one training of the whole scene; recipe and protocol are in ``blocks.json``
+    options: TrainOptions  # for one training of the whole scene; recipe and protocol are in ``blocks.json``
     step: Callable[[BlocksTask, OnEvent], dict[str, Any]]  # does the work, or continues it
     block: str = ""  # its name, for tasks of one block
 

@@ -23,7 +23,7 @@ class Cells:
     high: np.ndarray  # [B, A]; infinite at the outside
     margin: float  # distance by which a block trains beyond its cell, world units
     side: float  # mean side of a cell, without the outermost 1 % of the weight, world units
-    names: tuple[str, ...]  # of the blocks: grid indices, ``1-3``
+    names: tuple[str, ...]  # names of the blocks: grid indices, ``1-3``
 
     def __len__(self) -> int:
         return len(self.names)

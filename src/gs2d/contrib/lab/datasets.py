@@ -18,7 +18,7 @@ from gs2d.errors import ProtocolError
 class SceneInfo:
     """One scene of a data set."""
 
-    name: str  # of the folder in the data set
+    name: str  # name of the folder in the data set
     protocol: str
     downscale: int  # factor by which images are shrunk
     images: str = "images"  # folder of the images
@@ -33,7 +33,7 @@ class DataSet:
     name: str
     title: str
     scenes: tuple[SceneInfo, ...]  # in the order of the paper's tables
-    evaluator: str  # of surfaces: "dtu", "tnt", "visible-surface", or "" without ground truth
+    evaluator: str  # evaluator of surfaces: "dtu", "tnt", "visible-surface", or "" without ground truth
 
     def scene(self, name: str) -> SceneInfo:
         """Return the scene of a name, ignoring case, or raise ProtocolError."""

@@ -17,7 +17,7 @@ from gs2d.io.run_dir import machine, versions
 
 NERF_SYNTHETIC_SIZE = (800, 800)  # px
 SHOWN_PIECES = 5  # missing files listed for each capture
-OFFICIAL_EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by data set
+OFFICIAL_EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # evaluators of the paper's surfaces, by data set
 
 
 def deviations_of(

@@ -192,14 +192,14 @@ class Alignment:
     messages: tuple[str, ...]  # warnings, one line each
     cameras: int  # number of cameras matched with the log
     camera_fraction: float  # fraction of these within the threshold of the protocol
-    camera_rms: float  # of these, m
-    camera_worst: float  # of these, m
+    camera_rms: float  # rms distance of these, m
+    camera_worst: float  # largest distance of these, m
     scale: float  # final scale from capture to scan
     shift: float | None  # rms distance by which the stages moved the mesh, tau
     shift_scale: float  # change of scale by the stages
     shift_degrees: float  # rotation by the stages
     transform_alone: float | None  # rms error of the mesh with ``_trans.txt`` alone, tau
-    # of each: ``voxel`` and ``threshold`` (m), ``points``, and the numbers of ``IcpResult``
+    # for each stage: ``voxel`` and ``threshold`` (m), ``points``, and the numbers of ``IcpResult``
     stages: tuple[dict[str, Any], ...]
     T_truth_mesh: np.ndarray  # [4, 4]
 

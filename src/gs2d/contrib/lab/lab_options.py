@@ -13,7 +13,7 @@ from gs2d.pipeline.prepare.options import CommonTraining, Options, Overrides, Re
 
 _PARTITION = "partition."  # prefix of changes of the partition in --set
 SWEEP = "sweep"  # the name of a table of chosen recipes
-TABLES = ("regularisation", "benchmark", "k", "freeze", "modules", "absgs")  # of the paper
+TABLES = ("regularisation", "benchmark", "k", "freeze", "modules", "absgs")  # tables of the paper
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,7 @@ from gs2d.pipeline.prepare.options import values
 from gs2d.training.events import Notice, OnEvent, ignore
 
 ABOUT = "about.json"
-FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrides")  # of all runs in a folder
+FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrides")  # shared options of a folder
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def check_folder(plan: Plan) -> None:
     for name, value in after.items():
         if before.get(name) != value:
             raise RunError(
-                f"{plan.options.out} has a table made with {name} = {before.get(name)}, now {value}; "
+                f"{plan.options.out} holds a table made with {name} = {before.get(name)}, now {value}; "
                 "choose another --out (--set cache=may stay: stages that are the same are taken from there)"
             )
 

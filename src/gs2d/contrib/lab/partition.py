@@ -61,7 +61,7 @@ class Partition:
     # iterations per photograph of that training, as a fraction of those of a block; 0 disables it
     seam_schedule: float = 0.2
     # Start of a block. "dense": the recipe's dense start from the photographs of the block, if the recipe has one;
-    # "coarse": the splats of the coarse model, which lack the detail of large photographs.
+    # "coarse": the splats of the coarse model, without the detail of large photographs.
     start: str = "dense"
     extent: str = "scene"  # unit of sizes and steps in a block: extent of all cameras ("scene") or of its own ("block")
 

@@ -29,7 +29,7 @@ OFFICIAL = ("dtu", "tnt")  # evaluators that need several files
 class SweepScene:
     """A capture of a sweep, with its protocol and ground truth."""
 
-    name: str  # of the folder
+    name: str  # name of the folder
     path: Path
     format: str
     protocol: Protocol

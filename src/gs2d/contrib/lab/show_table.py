@@ -37,7 +37,7 @@ def show_table(command: SweepCommand, console: Console) -> None:
             else ""
         )
         raise RunError(
-            f"{len(result.failures)} of the runs failed; the table has no figures for them: "
+            f"{len(result.failures)} of the runs failed; the table lacks their figures: "
             f"{name}: {reason}{more}; fix that and run the command again"
         )
 

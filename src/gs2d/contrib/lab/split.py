@@ -40,7 +40,7 @@ class BlockOfSplit:
     frozen: int  # coarse splats that are frozen
     core: int  # coarse splats that lie in the cell
     weight: float  # fraction of the visible weight of the scene in the cell and its margin
-    extent: float  # of the cameras of the block, world units
+    extent: float  # extent of the cameras of the block, world units
     skipped: str = ""  # reason if the block is not trained, else empty
 
 

@@ -232,7 +232,7 @@ class SurfaceScore:
     accuracy_median: float | None
     completeness_median: float | None
     scores: tuple[ThresholdScore, ...]
-    diagonal: float  # of the bounding box of the truth
+    diagonal: float  # diagonal of the bounding box of the truth
     mesh_points: int  # number of scored points
     truth_points: int
     # fraction of the area (of the points, for a cloud) that the cameras do not see, which is not scored

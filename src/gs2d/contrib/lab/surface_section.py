@@ -22,7 +22,7 @@ _CLOUDS = (
     "Mesh above, true surface below, along three axes: green where the other surface is close, red where it is far, "
     "grey out of reach. The point clouds are in surface/."
 )
-_MEANINGS = {  # of the entries of metrics.json, in the order of the report
+_MEANINGS = {  # entries of metrics.json, in the order of the report
     "evaluator": ("Protocol", ""),
     "unit": ("Unit", "of all distances"),
     "ground_truth": ("True surface", ""),

@@ -22,7 +22,7 @@ from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.run_dir import make_folder
 from gs2d.io.splat_ply import ply_kind
 
-APART = 0.05  # of the diagonal of the truth: a larger median distance suggests a wrong coordinate system
+APART = 0.05  # fraction of the diagonal of the truth; a larger median distance suggests a wrong coordinate system
 MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # files beside a capture
 COUNTS_SUFFIX = "_seen.npy"  # FILE_seen.npy beside FILE.ply: number of views that see each face
 

@@ -419,7 +419,7 @@ class CascadeSurface:
         return Mesh(np.concatenate(self._vertices)[first], faces.astype(np.int32), colors)
 
 
-ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")  # of a volume, a row for each block; colours may be None
+ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")  # fields of a volume, a row per block; colours may be None
 
 
 def _rows_of(volume: Volume, rows: np.ndarray) -> Volume:

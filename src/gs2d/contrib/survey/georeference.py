@@ -22,7 +22,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import GEOREFERENCE
 
-FORMAT = 1  # of georeference.json
+FORMAT = 1  # version of georeference.json
 Role = Literal["fitted", "left out", "check"]
 FITTED: Role = "fitted"
 LEFT_OUT: Role = "left out"
