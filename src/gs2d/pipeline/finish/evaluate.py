@@ -81,11 +81,10 @@ def evaluate_run(
         best = tuple(aligned(trained, shown.scene.test, on_event))
         result |= split_metrics(score_views(trained, best, on_event, lpips=lpips), "test_aligned", "test")
     if truth is not None and has_mesh:
-        mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds
+        mesh, scene, folder = read_mesh(run.file(MESH)), trained.scene, run.file(SURFACE)
         on_event(Phase("scoring the surface", 0))
-        result["surface"] = score_surface(
-            mesh, truth, trained.scene, folder=folder, notify=notify, thresholds=thresholds
-        )
+        thresholds = options.thresholds
+        result["surface"] = score_surface(mesh, truth, scene, folder=folder, notify=notify, thresholds=thresholds)
     elif truth is not None:
         on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():
