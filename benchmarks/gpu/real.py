@@ -17,9 +17,9 @@ import numpy as np
 from benchmarks.gpu.bench import Bench, kernel_times
 from benchmarks.gpu.first import TRACED, timed
 from gs2d.config.presets import get_recipe
-from gs2d.config.protocols import protocol_for
 from gs2d.config.schedule import scale_schedule
 from gs2d.data import load_scene
+from gs2d.data.known_captures import protocol_for
 from gs2d.render import cuda_passes
 from gs2d.training.trainer import Trainer, TrainerOptions
 

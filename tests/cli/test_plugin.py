@@ -57,7 +57,8 @@ def trained(gs2d: CliProcess, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "link" / "capture.txt").write_text(str(capture))
     few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--set", "page=false")
     chosen = ("--recipe", "example-2dgs", "--backend", "example-checked")
-    gs2d("train", folder / "link", "--out", folder / "run", *chosen, *few)
+    done = gs2d("train", folder / "link", "--out", folder / "run", *chosen, *few)
+    assert "example-tint: Numbers of 6 photographs, from -0." in done.stdout + done.stderr
     return folder / "run"
 
 
@@ -65,6 +66,7 @@ def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
     said = json.loads((trained / "run.json").read_text())
     assert said["backend"]["name"] == "example-checked"
     assert said["recipe"]["name"] == "example-2dgs"
+    assert said["protocol"]["name"] == "nerf-synthetic"
     assert said["recipe"]["stages"][0]["densify"] == {"name": "example-prune", "options": {"at": 3, "count": 2}}
     events = [json.loads(line) for line in (trained / "events.jsonl").read_text().splitlines()]
     losses = next(event["losses"] for event in events if "losses" in event)
@@ -113,6 +115,8 @@ def test_another_process_finds_the_package_and_exports_its_format(
 def test_its_method_makes_a_mesh(gs2d: CliProcess, trained: Path, tmp_path: Path) -> None:
     made = json.loads(gs2d("mesh", trained, "--method", "example-coarse", "--out", tmp_path / "a.ply", "--json").stdout)
     assert made["method"] == "example-coarse"
+    refused = gs2d("mesh", trained, "--method", "example-coarse", "--watertight", code=2).stderr
+    assert "--watertight needs a method that closes (delaunay), got example-coarse; leave one of them out" in refused
 
 
 def test_its_evaluator_scores_the_surface(gs2d: CliProcess, trained: Path) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from gs2d.config.protocols import DTU, GENERIC, PROTOCOLS, get_protocol, protocol_for
+from gs2d.config.protocols import DTU, GENERIC, PROTOCOLS, get_protocol
 from gs2d.config.recipe import LossTerm
+from gs2d.data.known_captures import protocol_for
 from gs2d.errors import ProtocolError
 
 

@@ -16,8 +16,10 @@ from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.tsdf import FusionOnDevice
+from gs2d.meshing.extract import extract
+from gs2d.meshing.mesh_methods import MESH_METHODS, MeshMethod
 from gs2d.meshing.tsdf_volume import Add, Volume, integrator
-from gs2d.pipeline.finish.run_mesh import extract_mesh, mesh_run
+from gs2d.pipeline.finish.run_mesh import check_mesh_options, extract_mesh, mesh_run
 from gs2d.pipeline.prepare.loaded import check_same_run, finished_splats, reload_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.resolve import with_fused_depth
@@ -106,6 +108,18 @@ def test_meshes_of_photographs_are_refined_and_those_of_data_sets_are_not(
     for options in (MeshOptions(), MeshOptions(refine=False)):
         mesh_run(run, options, out=tmp_path / f"{options.refine}.ply", threads=1)
     assert (tmp_path / "True.ply").read_bytes() == (tmp_path / "False.ply").read_bytes()
+
+
+def test_watertight_meshes_need_a_method_that_closes(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = mesh_run(run, MeshOptions(watertight=True), out=tmp_path / "closed.ply", threads=1)
+    assert made["method"] == "delaunay"  # instead of the default
+    monkeypatch.setitem(MESH_METHODS._objects, "shell", MeshMethod(extract, closes=True))
+    check_mesh_options(MeshOptions(method="shell", watertight=True))
+    monkeypatch.setitem(MESH_METHODS._objects, "shell", MeshMethod(extract))
+    with pytest.raises(ProtocolError, match="a method that closes .delaunay., got shell; leave one of them out"):
+        check_mesh_options(MeshOptions(method="shell", watertight=True))
 
 
 def test_interrupting_a_refinement_keeps_the_mesh(photographed: Path) -> None:

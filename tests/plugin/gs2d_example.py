@@ -52,6 +52,8 @@ class Brightness(gs2d.Loss):
 class LinkReader:
     """A folder whose capture.txt names the folder where the capture is."""
 
+    protocol = "nerf-synthetic"
+
     def detect(self, path):
         return (path / "capture.txt").is_file()
 

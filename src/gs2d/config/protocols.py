@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 
 from gs2d.config.recipe import LossTerm
 from gs2d.config.registry import Registry
@@ -169,7 +168,6 @@ PROTOCOLS: Registry[Protocol] = Registry(
 )
 for _protocol in (DTU, NERF_SYNTHETIC, GENERIC):
     PROTOCOLS.register(_protocol.name, module=__name__)(_protocol)
-_BY_FORMAT = MappingProxyType({"blender": NERF_SYNTHETIC, "dtu": DTU})
 
 
 def get_protocol(name: str) -> Protocol:
@@ -180,8 +178,3 @@ def get_protocol(name: str) -> Protocol:
     if name not in PROTOCOLS:
         raise ProtocolError(PROTOCOLS.unknown(name, also=("auto",)))
     return PROTOCOLS[name]
-
-
-def protocol_for(scene_format: str) -> Protocol:
-    """Return the default protocol of a capture format (``Scene.format``)."""
-    return _BY_FORMAT.get(scene_format, GENERIC)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
+from gs2d.config.protocols import GENERIC, get_protocol
 from gs2d.config.protocols import Protocol as CaptureProtocol
-from gs2d.config.protocols import get_protocol, protocol_for
 from gs2d.config.registry import Registry
+from gs2d.data.readers.capture_readers import READERS
 
 
 class KnownCaptures(Protocol):
@@ -21,6 +22,12 @@ class KnownCaptures(Protocol):
 
 
 DATA_SETS: Registry[KnownCaptures] = Registry("data set", "gs2d.data_sets")
+
+
+def protocol_for(scene_format: str) -> CaptureProtocol:
+    """Return the default protocol of a capture format: the one that its reader names."""
+    reader = READERS.get(scene_format)() if scene_format in READERS else None
+    return get_protocol(getattr(reader, "protocol", GENERIC.name))
 
 
 def protocol_of(root: Path, scene_format: str) -> CaptureProtocol:

@@ -16,6 +16,7 @@ class MeshMethod:
 
     extract: Callable[..., Any]  # has the signature of ``gs2d.meshing.extract.extract``
     bounded: bool = True  # False: meshes everything instead of the subject; a box is that of the finest detail
+    closes: bool = False  # whether it closes the surface everywhere if ``ExtractOptions.watertight`` is set
 
 
 MESH_METHODS: Registry[MeshMethod] = Registry(
@@ -26,24 +27,15 @@ MESH_METHODS: Registry[MeshMethod] = Registry(
 )
 """Methods of mesh extraction, by name."""
 
-WHOLE = "unbounded"  # of the whole scene: with equal voxels thin things near the cameras would vanish
 
-
-def method_name(method: str, *, watertight: bool, whole_scene: bool) -> str:
-    """Return the name of the method that options select; only Delaunay tetrahedra close a surface."""
-    if watertight:
-        return "delaunay"
-    return WHOLE if whole_scene and method == "tsdf" and WHOLE in MESH_METHODS else method
-
-
-def register_mesh_method(name: str, *, bounded: bool = True) -> Callable[[Register], Register]:
+def register_mesh_method(name: str, *, bounded: bool = True, closes: bool = False) -> Callable[[Register], Register]:
     """Return a decorator that registers a method of mesh extraction, for ``gs2d mesh --method NAME``.
 
     Parameters
     ----------
     name : str
         Must not be taken.
-    bounded : bool
+    bounded, closes : bool
         As in ``MeshMethod``.
 
     Returns
@@ -55,7 +47,7 @@ def register_mesh_method(name: str, *, bounded: bool = True) -> Callable[[Regist
 
     def registered(extract: Register) -> Register:
         method: Any = extract
-        MESH_METHODS.register(name, module=method.__module__)(MeshMethod(method, bounded))
+        MESH_METHODS.register(name, module=method.__module__)(MeshMethod(method, bounded, closes))
         return extract
 
     return registered

@@ -29,6 +29,7 @@ class FileReader:
     find: Callable[[Path], Path | None]
     read_capture: Callable[[Path], Capture]
     before_colmap: bool = False
+    protocol: str = "generic"
 
     def detect(self, path: Path) -> bool:
         """Return whether the folder has the file."""

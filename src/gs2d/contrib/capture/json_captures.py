@@ -85,7 +85,7 @@ def _finder(name: str) -> Callable[[Path], Path | None]:
     return find
 
 
-_BLENDER = FileReader(f"{TRAIN} (Blender)", _finder(TRAIN), read_blender, before_colmap=True)
+_BLENDER = FileReader(f"{TRAIN} (Blender)", _finder(TRAIN), read_blender, before_colmap=True, protocol="nerf-synthetic")
 _NERFSTUDIO = FileReader(f"{CAMERAS} (nerfstudio)", _finder(CAMERAS), read_nerfstudio, before_colmap=True)
 register_file_reader("blender", _BLENDER, __name__)
 register_file_reader("nerfstudio", _NERFSTUDIO, __name__)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gs2d.config.protocols import Protocol, get_protocol, protocol_for
+from gs2d.config.protocols import Protocol, get_protocol
 from gs2d.contrib.lab.datasets import (
     DATASETS,
     DTU_SCENES,
@@ -23,7 +23,7 @@ from gs2d.contrib.lab.visible_surface import MESH_TRUTHS
 from gs2d.core.image_arrays import is_number
 from gs2d.core.json_files import read_json
 from gs2d.data.file_names import Files, in_any_case
-from gs2d.data.known_captures import DATA_SETS
+from gs2d.data.known_captures import DATA_SETS, protocol_for
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import DataError
 

@@ -97,6 +97,7 @@ class DtuReader:
 
     looks_for = f"{' or '.join(CAMERA_FILES)} (DTU)"
     before_colmap = True
+    protocol = "dtu"
 
     def detect(self, path: Path) -> bool:
         """Return whether the folder has projection matrices."""

@@ -51,7 +51,7 @@ TAUBIN = (0.5, -0.53)  # smoothing steps: shrink and grow (Taubin 1995)
 TAUBIN_ROUNDS = 2
 
 
-@register_mesh_method("delaunay")
+@register_mesh_method("delaunay", closes=True)
 def extract_delaunay(
     frames: Iterable[RenderedView],
     options: ExtractOptions = ExtractOptions(),  # noqa: B008 (frozen)

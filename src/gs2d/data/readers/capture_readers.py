@@ -18,7 +18,8 @@ class Reader(Protocol):
     """How a capture format is detected and read. Register a class whose constructor needs no arguments.
 
     Optional attributes: ``looks_for`` names the expected files in messages, such as "cameras.xml (Metashape)";
-    ``before_colmap = True`` tests a format first whose captures also contain a COLMAP model.
+    ``before_colmap = True`` tests a format first whose captures also contain a COLMAP model; ``protocol`` names the
+    protocol of its captures (default: "generic").
     """
 
     def detect(self, path: Path) -> bool:

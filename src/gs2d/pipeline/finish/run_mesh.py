@@ -30,7 +30,7 @@ from gs2d.kernels.library import ready_library
 from gs2d.meshing.convex_pieces import convex_pieces, required
 from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.extract import Extraction, ExtractOptions
-from gs2d.meshing.mesh_methods import MESH_METHODS, method_name
+from gs2d.meshing.mesh_methods import MESH_METHODS
 from gs2d.meshing.refine import Refinement, RefineSettings
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES
@@ -168,10 +168,11 @@ def check_mesh_options(options: MeshOptions) -> None:
         required()  # before minutes are spent
     method = _method_name(options)
     if method not in MESH_METHODS:
-        raise ProtocolError(f"{'--watertight' if options.watertight else '--method'}: {MESH_METHODS.unknown(method)}")
-    MESH_METHODS.get(method)  # its package can be imported
-    if options.watertight and options.method not in ("tsdf", "delaunay"):
-        raise ProtocolError(f"--watertight uses --method delaunay, got {options.method}; leave one of them out")
+        raise ProtocolError(f"--method: {MESH_METHODS.unknown(method)}")
+    closes = MESH_METHODS.get(method).closes  # its package can be imported
+    if options.watertight and not closes:
+        closing = ", ".join(name for name, other in MESH_METHODS.working() if other.closes) or "none is installed"
+        raise ProtocolError(f"--watertight needs a method that closes ({closing}), got {method}; leave one of them out")
     if options.bbox is not None:
         checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
@@ -208,7 +209,14 @@ def _extract(trained: Trained, options: MeshOptions, on_event: OnEvent, subject:
 
 
 def _method_name(options: MeshOptions) -> str:
-    return method_name(options.method, watertight=options.watertight, whole_scene=options.whole_scene)
+    """Return the name of the method: the default is replaced by one that closes, or one for the whole scene.
+
+    With equal voxels thin parts near the cameras would vanish from a whole scene.
+    """
+    if options.method != MeshOptions.method or not (options.watertight or options.whole_scene):
+        return options.method
+    suitable = (name for name, one in MESH_METHODS.working() if (one.closes if options.watertight else not one.bounded))
+    return next(suitable, options.method)
 
 
 def _error(trained: Trained, options: MeshOptions) -> float:

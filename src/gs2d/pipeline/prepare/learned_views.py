@@ -18,7 +18,6 @@ from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import LEARNED, POSES, SPLATS, RunFolder
 from gs2d.training.events import Notice, OnEvent
-from gs2d.training.learned.image_exposure import exposure_gain
 from gs2d.training.learned.learned_table import numbers_of, shown, unshown
 from gs2d.training.learned.quantity import ImagePoints
 
@@ -44,11 +43,10 @@ def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
         return
     views = {view: {name: numbers.tolist() for name, numbers in values.items()} for view, values in appearances.items()}
     write_json(run.file(LEARNED), {"format": 2, "about": APPEARANCE, "views": views})
-    exposures = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
-    if exposures:
-        gains = {name: exposure_gain(transform) for name, transform in exposures.items()}
-        low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
-        on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {LEARNED}"))
+    for name in sorted({name for numbers in views.values() for name in numbers if name in QUANTITIES}):
+        report = QUANTITIES.get(name).report(name, {"views": views, "frames": []})
+        if report is not None:
+            on_event(Notice(f"{name}: {report.text.partition('. ')[0].rstrip('.')}: {LEARNED}"))
 
 
 def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:

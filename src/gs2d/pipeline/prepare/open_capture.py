@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gs2d.config.protocols import Protocol, get_protocol, protocol_for
+from gs2d.config.protocols import Protocol, get_protocol
 from gs2d.core.json_files import read_json
 from gs2d.data import Scene, detect_format, load_scene
-from gs2d.data.known_captures import missing_lines, protocol_of
+from gs2d.data.known_captures import missing_lines, protocol_for, protocol_of
 from gs2d.data.load import reader_of
 from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.scene import PointCloud, View
