@@ -18,7 +18,7 @@ from gs2d.core.camera import Camera
 SIDE = 100  # px: images are reduced to this longer side, which also averages their noise
 SAMPLES = 200  # pixels of an image that are compared with each other image
 APART = 3.0  # px: smallest distance between the matches of both assumptions
-LEAST = 50  # compared pixels, below which images do not tell
+LEAST = 50  # compared pixels, below which images cannot decide
 MOST = 20_000  # compared pixels, chosen at random
 DARKEST = 0.02  # brightness, [0, 1], below which the logarithm is cut off
 OUTLIER = 0.1  # largest difference of log brightness that counts
@@ -48,11 +48,11 @@ def smooth_area(
         return np.asarray(cut.reshape(height, factor, width, factor).mean(axis=(1, 3)))
 
     column, row = np.minimum(pixels / factor, (width - 1, height - 1)).astype(np.int64).T
-    known = np.zeros((height, width))
-    known[row, column] = depth
-    nearest = distance_transform_edt(known == 0, return_distances=False, return_indices=True)
+    sparse = np.zeros((height, width))
+    sparse[row, column] = depth
+    nearest = distance_transform_edt(sparse == 0, return_distances=False, return_indices=True)
     brightness = np.log(np.maximum(blocks(image.mean(axis=2)), DARKEST))
-    return SmoothArea(camera, factor, brightness, blocks(sky) == 1, known[tuple(nearest)])
+    return SmoothArea(camera, factor, brightness, blocks(sky) == 1, sparse[tuple(nearest)])
 
 
 def at_infinity(areas: Sequence[SmoothArea]) -> bool:
@@ -83,8 +83,8 @@ def _matches(areas: Sequence[SmoothArea]) -> tuple[np.ndarray, np.ndarray, np.nd
             motion = there.camera.T_cam_world @ np.linalg.inv(camera.T_cam_world)
             turned = rays @ motion[:3, :3].T
             moved = turned * area.depth[row, column, None] + motion[:3, 3]
-            (far, seen_far), (near, seen_near) = _places(there, turned), _places(there, moved)
-            fits = seen_far & seen_near & (np.linalg.norm(far - near, axis=1) > APART)
+            (far, inside_far), (near, inside_near) = _places(there, turned), _places(there, moved)
+            fits = inside_far & inside_near & (np.linalg.norm(far - near, axis=1) > APART)
             here = np.stack([np.full(len(row), index), row, column], axis=1)[fits]
             ends = (np.insert(places[fits], 0, other, axis=1) for places in (far, near))
             parts.append((here, *ends))
