@@ -106,7 +106,7 @@ def test_a_capture_that_cannot_be_read_gives_one_line_and_exit_code_2_and_leaves
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        ('{"min_angle": 34.9}', "photographs"),
+        ('{"min_angle": 34.9}', "viewing directions"),
         ('{"side": 1}', "dense_start.side"),
         ('{"fit": 3}', "dense_start.fit must be true or false"),
     ],
