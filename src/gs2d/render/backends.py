@@ -221,7 +221,7 @@ class Backend:
         return torch_kernels.first_not_finite(tensors)
 
     # -- description -------------------------------------------------------------------------------------------------
-    def facts(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """Return everything that determines the computed bits: equal facts, equal bits."""
         return {"name": self.name}
 

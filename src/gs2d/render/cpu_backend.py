@@ -164,7 +164,7 @@ class CpuBackend(KernelBackend):
         first = int(native.call("gs2d_first_not_finite", pointers, sizes, count))
         return None if first == count else first
 
-    def facts(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
         """Return name, instruction set and version."""
         return {
             "name": self.name,

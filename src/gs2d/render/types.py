@@ -84,7 +84,7 @@ class RasterSettings:
         """Return the settings that render these kinds of depth; None is ignored."""
         return replace(self, with_transmittance_depth=self.with_transmittance_depth or TRANSMITTANCE in kinds)
 
-    def facts(self) -> dict[str, Any]:
+    def constants(self) -> dict[str, Any]:
         """Return the constants by name, for files, without ``with_transmittance_depth``, which losses determine."""
         return {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("derived")}
 

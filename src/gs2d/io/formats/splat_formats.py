@@ -259,14 +259,14 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
     return SplatFile(kind, gaussians, gaussians.disks() if flat else None, tuple(dict.fromkeys(notes)))
 
 
-def read_splats(path: str | os.PathLike[str], tell: Warn = warnings.warn) -> Splats:
+def read_splats(path: str | os.PathLike[str], warn: Warn = warnings.warn) -> Splats:
     """Read flat splats from a file of any format that gs2d writes.
 
     Parameters
     ----------
     path : path
         PLY (2DGS, 3DGS or compressed), .spz, .splat, .usd, .glb or .sog.
-    tell : callable
+    warn : callable
         Receives a message if splats or SH bands are dropped (default: a Python warning).
 
     Returns
@@ -289,7 +289,7 @@ def read_splats(path: str | os.PathLike[str], tell: Warn = warnings.warn) -> Spl
                 raise DataError(f"{path} must be a file of splats or a run folder{suggestion(Path(path), 'run')}")
     file = read_splat_file(path)
     for note in file.notes:
-        tell(note)
+        warn(note)
     return file.gaussians.to_surfels(path) if file.surfels is None else file.surfels
 
 

@@ -91,7 +91,7 @@ class ResolvedRun:
     scene: CaptureRecord
     downscale: int  # factor by which the photographs are smaller than their files
     raster: RasterSettings
-    backend: Mapping[str, Any]  # settings that determine its results (`Backend.facts`)
+    backend: Mapping[str, Any]  # settings that determine its results (`Backend.identity`)
     schedule_scale: float = 1.0  # trained fraction of the full schedule
     title: str = ""  # heading of the report; empty: the name of the capture
     init: str | None = None  # hash of the file of initial splats
@@ -100,7 +100,7 @@ class ResolvedRun:
 
     def to_json(self) -> dict[str, Any]:
         """Return the run as plain JSON values."""
-        return {**encode(self), "raster": self.raster.facts(), "seed": self.recipe.seed}
+        return {**encode(self), "raster": self.raster.constants(), "seed": self.recipe.seed}
 
     def decisive_fields(self) -> dict[str, Any]:
         """Return what determines the bytes of the splats, as JSON values.
@@ -259,7 +259,7 @@ def loaded_run(options: TrainOptions, recipe: Recipe, capture: OpenCapture, dige
         scene=CaptureRecord.of(capture.scene, digest),
         downscale=capture.downscale,
         raster=raster_settings(capture.protocol, capture.scene.extent, recipe.sh_degree, recipe.mip_px),
-        backend=capture.backend.facts(),
+        backend=capture.backend.identity(),
         execution=Execution(**values(Execution, options)),
         **extra,
     )
