@@ -29,6 +29,7 @@ TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
 demo: $(VENV)/installed
 	$(VENV)/bin/gs2d demo
+	@echo "gs2d is $(VENV)/bin/gs2d; to type gs2d alone: . $(VENV)/bin/activate"
 
 test: lint
 	$(TEST_ENV) $(PY) -m pytest -m "not slow" -n $(WORKERS) --dist worksteal -q $(TEST_ARGS)
@@ -73,7 +74,8 @@ clean:
 
 # The wheel as users get it (not editable): the tests test what is shipped. --no-build-isolation uses the pinned tools.
 $(VENV)/installed: $(VENV)/dependencies $(SOURCES)
-	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP) install --no-deps --no-build-isolation --force-reinstall .
+	@echo "compiling the kernels, minutes"
+	@PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP) install --no-deps --no-build-isolation --force-reinstall .
 	@touch $@
 
 $(VENV)/docs: $(VENV)/dependencies
@@ -87,8 +89,10 @@ $(VENV)/dependencies: constraints.txt pyproject.toml
 		echo "error: no Python >= 3.11 found; install one, or run make PYTHON=/path/to/python" >&2; exit 1; }
 	@test -x $(PY) || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "error: $(PYTHON) cannot make a virtual environment; on Debian: apt install python3-venv" >&2; exit 1; }
-	$(PY) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+	@$(PY) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
 		print("scikit-build-core", "cmake", "ninja", \
 		*p["dependencies"], *p["optional-dependencies"]["dev"], sep="\n")' > $(VENV)/requirements.txt
-	$(PIP) install --no-compile -c constraints.txt -r $(VENV)/requirements.txt
+	@echo "downloading the dependencies into $(VENV), minutes: on Linux 5 GB, as torch brings CUDA;" \
+		"without a GPU see docs/guides/install.md#make"
+	@$(PIP) install --no-compile -c constraints.txt -r $(VENV)/requirements.txt
 	@touch $@

@@ -6,6 +6,7 @@ import dataclasses
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -50,6 +51,18 @@ def test_a_mistyped_command_line_gives_one_line_with_a_suggestion(
     out, err = capsys.readouterr()
     assert out == ""
     assert named in one_line(err)
+
+
+def test_several_files_instead_of_a_folder_suggest_the_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [str(tmp_path / name) for name in ("a.jpg", "b.jpg")]
+    for file in files:
+        Path(file).touch()
+    assert run(["reconstruct", *files, "--out", "there"]) == 2
+    assert "give the folder of the files" in one_line(capsys.readouterr().err)
+    assert run(["reconstruct", "my", "photographs", "--out", "there"]) == 2
+    assert "a path with spaces needs quotes" in one_line(capsys.readouterr().err)
 
 
 def test_a_folder_instead_of_a_command_suggests_reconstruct(

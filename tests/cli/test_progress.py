@@ -85,6 +85,11 @@ def test_a_log_file_gets_one_line_per_phase_and_occasional_progress(
     assert len(err) == 11
 
 
+def test_a_title_is_not_wrapped_to_the_width_of_its_table(capsys: pytest.CaptureFixture[str]) -> None:
+    Console(quiet=False, as_json=False).table("Modules [I]: scenes of NeRF-Synthetic", ["", "MB"], [["(I)", "-"]])
+    assert capsys.readouterr().out.splitlines()[0] == "Modules [I]: scenes of NeRF-Synthetic"
+
+
 def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
     quiet, as_json = Console(quiet=True, as_json=True), Console(quiet=False, as_json=True)
     for console in (quiet, as_json):

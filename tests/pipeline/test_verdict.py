@@ -144,6 +144,11 @@ def test_missing_measures_are_reported_and_do_not_change_the_grade() -> None:
     for name in ("new views", "floaters"):
         assert (found(measures, name).grade, found(measures, name).figure) == (None, "not measured")
     assert "--test-every 8" in found(measures, "new views").text
+    few, many, captured = (
+        found(replace(measures, placed=count, count=count), "new views").advice for count in (11, 24, None)
+    )
+    assert few == "Take 30 or more photographs: with 11, new views were not checked."
+    assert many == captured == ""
     assert judge(Measures(views(train=21.0)[:20])).grade == "poor"
     assert judge(Measures((), 24, 24)).grade is None
 

@@ -194,7 +194,9 @@ class Console:
         self.close()
         if self.quiet or self.as_json:
             return
-        table = Table(title=escape(title) or None, title_justify="left", box=None, pad_edge=False)
+        if title:
+            self._out.print(title, markup=False, style="italic")  # rich would wrap it to the width of the columns
+        table = Table(box=None, pad_edge=False)
         for i, column in enumerate(columns):
             table.add_column(escape(printable(column)), justify="left" if i == 0 else "right", no_wrap=True)
         for row in rows:

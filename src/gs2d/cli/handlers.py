@@ -19,7 +19,7 @@ from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 
-WIDTH = 60  # columns of the verdict: half of a small screen
+WIDTH = 78  # columns of the verdict
 _NAMES, _GRADES = 14, 8  # columns of the names and grades of findings
 _FILES = ("report.html", "scene.html", "mesh.ply", "mesh.glb", "splats.ply")
 EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows without --all
@@ -27,7 +27,10 @@ EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows wi
 
 # -- tables and lines --------------------------------------------------------------------------------------------------
 def show_run(run: RunFolder, console: Console, *, definition: bool = False, **extra: Any) -> None:
-    """Print the metrics of a run as a table, its files, and its verdict; with ``--json`` also ``extra``."""
+    """Print the metrics of a run as a table, its files, and its verdict; with ``--json`` also ``extra``.
+
+    ``definition``: also recipe, scene and views, but not the command to run next.
+    """
     from gs2d.report.sections.verdict_section import read_verdict
 
     path, metrics = run.path, run.metrics()
@@ -35,7 +38,8 @@ def show_run(run: RunFolder, console: Console, *, definition: bool = False, **ex
     if definition:
         result["definition"] = whole = run.definition()
         recipe, scene = whole["recipe"]["name"], whole["scene"]
-        console.say(f"{recipe} on {scene['name']} ({scene['format']}, {scene['train']} + {scene['test']} views)")
+        views = f"{scene['train']} training and {scene['test']} test views"
+        console.say(f"{recipe} on {scene['name']} ({scene['format']}, {views})")
     columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
     console.table("", columns, [_stage_row(stage) for stage in metrics["stages"]])
     show_surface(metrics.get("surface"), console)
@@ -49,6 +53,9 @@ def show_run(run: RunFolder, console: Console, *, definition: bool = False, **ex
     result["verdict"] = verdict
     for line in verdict_lines(verdict) if verdict is not None else ():
         console.say(line)
+    if not definition:
+        page = f"open {PAGE} in a browser, or " if (path / PAGE).exists() else ""
+        console.say(f"look at it: {page}gs2d view {shlex.quote(str(path))}")
     console.result(result)
 
 
@@ -258,7 +265,6 @@ def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
 
     run = run_all(command, console.on_event)
     show_run(run, console, poses=read_json(run.path / CAPTURE / POSES_JSON))
-    console.say(f"look at it: open {PAGE} in a browser, or gs2d view {shlex.quote(str(run.path))}")
 
 
 def poses(command: c.PosesCommand, console: Console) -> None:
@@ -350,7 +356,7 @@ def _optional() -> dict[str, dict[str, Any]]:
     for extra, (used_by, packages) in _EXTRAS.items():
         entries[extra] = _entry(used_by, {name: _version(name) for name in packages}, install(extra))
     heic = next((name for name in ("pi-heif", "pillow-heif") if _version(name) is not None), "pi-heif")
-    entries["heic"] = _entry("HEIC photographs, as of an iPhone", {heic: _version(heic)}, _HEIC)
+    entries["heic"] = _entry("HEIC photographs (iPhone)", {heic: _version(heic)}, _HEIC)
     programs = {name: shutil.which(name) for name in ("ffmpeg", "ffprobe")}
     entries["ffmpeg"] = _entry("videos, read and written (gs2d render --video x.mp4)", programs, FFMPEG)
     return entries

@@ -79,7 +79,8 @@ def _field_values(name: str, words: Sequence[str]) -> dict[str, Any]:
         raise UsageError(_no_option(name, unknown.partition("=")[0], options))
     if rest:
         arguments = " ".join(option.usage for option in options if option.mark.positional)
-        takes = f"{arguments} and options; a path with spaces needs quotes" if arguments else "options only"
+        remedy = "give the folder of the files" if Path(rest[0]).is_file() else "a path with spaces needs quotes"
+        takes = f"{arguments} and options; {remedy}" if arguments else "options only"
         raise UsageError(f"unexpected {rest[0]!r}: the command takes {takes}")
     values = {field: value for field, value in vars(parsed).items() if value not in (None, [])}
     values |= _settings(values.pop(_OVERRIDES, ()), options, trains)

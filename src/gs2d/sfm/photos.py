@@ -101,7 +101,7 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
         notes.append(f"{_some(others, root)} ignored: no photographs")
     warning = _about_unread(unread, len(photos), root)
     if len(photos) < FEWEST:
-        got = f"{len(photos)} photographs" if photos else "none"
+        got = str(len(photos) or "none")
         why = next((f"; {line}" for line in (warning, *notes) if line), "")
         raise DataError(f"{root} must hold {FEWEST} or more photographs, got {got}{why or '; ' + _SHOOTING}")
     return photos, tuple(notes), warning

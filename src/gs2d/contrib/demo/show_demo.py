@@ -12,3 +12,4 @@ def show_demo(command: DemoCommand, console: Console) -> None:
     """Run the demo and print its results."""
     run = demo(command, console.on_event)
     show_run(run, console)
+    console.say("your own photographs: gs2d reconstruct PHOTOS --out RUN --quality draft")

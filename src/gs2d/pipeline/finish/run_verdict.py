@@ -27,7 +27,7 @@ from gs2d.io.run_dir import VERDICT, RunFolder
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.prepare.loaded import Trained
-from gs2d.pipeline.prepare.open_capture import placed_photographs
+from gs2d.pipeline.prepare.open_capture import FEW, placed_photographs
 from gs2d.render.types import RenderOutput
 from gs2d.report.sections.verdict_section import read_verdict
 
@@ -194,8 +194,10 @@ def _quality(measures: Measures) -> list[Finding]:
     train = [view.psnr for view in measures.views if view.split == "train" and view.psnr is not None]
     trained = fmean(train) if train else None
     if not test:
-        text = "All photographs trained. `--test-every 8` holds out every eighth photograph to check new views."
-        new = Finding("new views", None, NOT_MEASURED, text)
+        text = "All photographs trained. --test-every 8 holds out every eighth photograph to check new views."
+        few = measures.count is not None and measures.count < FEW
+        advice = f"Take 30 or more photographs: with {measures.count}, new views were not checked." if few else ""
+        new = Finding("new views", None, NOT_MEASURED, text, advice)
         if trained is None:
             return [new]
         grade = grades.TRAINING_VIEWS.grade(trained)

@@ -185,9 +185,11 @@ def _training_line(loaded: LoadedRun) -> str:
     shrunk = f" (--downscale {resolved.downscale})" if resolved.downscale > 1 else ""
     shortened = f" (--schedule-scale {resolved.schedule_scale:g})" if resolved.schedule_scale != 1 else ""
     if scene.test:
-        split = f"{len(scene.test)} are held out for testing" + ("" if scene.own_split else " (--test-every 0: none)")
+        split, other = f"{len(scene.test)} are held out for testing", "--test-every 0 trains on all"
     else:
-        split = "none is held out for testing" + ("" if scene.own_split else " (--test-every 8: every eighth)")
+        split, other = "none is held out for testing", "--test-every 8 holds out every eighth"
+    if not scene.own_split:
+        split += f" ({other})"
     return (
         f"{len(scene.train)} of {len(scene.views)} photographs train at {camera.width}x{camera.height}{shrunk} for "
         f"{loaded.recipe.iterations:,} iterations{shortened}; {split}"
