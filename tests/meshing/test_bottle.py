@@ -52,7 +52,7 @@ def test_exact_depth_of_the_bottle_scene_reproduces_its_surface(shared: Callable
     assert result.limits.voxel == pytest.approx(0.007, abs=0.001)  # half a pixel: 4 / 278 / 2
     assert result.limits.truncation == pytest.approx(5 * result.limits.voxel)  # exact maps agree
     assert result.limits.cut_fraction == 0
-    score = evaluate_surface(result.mesh, truth, cameras=cameras, seen=seen, samples=30_000)
+    score = evaluate_surface(result.mesh, truth, cameras=cameras, view_counts=seen, samples=30_000)
     assert score.mesh_hidden < 0.01
     assert [s.f_score > least for s, least in zip(score.scores, (0.98, 0.99, 0.995), strict=True)] == [True] * 3
     assert score.chamfer is not None
