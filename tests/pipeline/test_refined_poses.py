@@ -96,6 +96,12 @@ def test_a_quantity_of_a_package_may_move_cameras(
     for view, before in zip(job.scene.train, load_scene(capture).train, strict=True):
         assert not np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
     assert evaluate_run(made.path)["train"]["psnr"] == made.metrics()["stages"][-1]["train"]["psnr"]
+    events: list[Event] = []
+    reload_run(made, events.append)
+    assert not any("guest" in event.text for event in events if isinstance(event, Notice))
+    monkeypatch.delitem(QUANTITIES._objects, "guest")
+    reload_run(made, events.append)
+    assert any("guest, whose package is not installed" in event.text for event in events if isinstance(event, Notice))
 
 
 def test_aligned_scores_are_added_on_request(run: RunFolder) -> None:

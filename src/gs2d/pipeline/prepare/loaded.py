@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from gs2d.config.protocols import Protocol
+from gs2d.config.quantities import QUANTITIES
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.registry import absent_guests
 from gs2d.config.serialize import decode, encode
@@ -311,6 +312,9 @@ def reload_run(run: RunFolder, on_event: OnEvent) -> LoadedRun:
         )
     scene = with_refined_poses(run, resolved.recipe, scene)
     scene = with_learned_appearance(run, resolved.recipe, scene)
+    for name in resolved.recipe.quantities:
+        if name not in QUANTITIES:
+            on_event(Notice(f"{run.path} learned {name}, whose package is not installed: results differ without it"))
     return LoadedRun(resolved, scene, get_backend(resolved.backend["name"]))
 
 
