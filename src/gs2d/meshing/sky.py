@@ -29,15 +29,15 @@ def sky_pixels(image: np.ndarray, points: np.ndarray, above: np.ndarray, valid: 
     factor = max(1, round(max(image.shape[:2]) / SIDE))
     shown = np.ones(image.shape[:2], bool) if valid is None else valid
     places = np.floor(np.asarray(points) / factor).astype(np.int64)
-    high = _shrunk(above, factor) == 1
-    sky = _smooth_areas(_shrunk(image, factor), places, high, _shrunk(shown, factor) == 1) & high
+    high = shrunk(above, factor) == 1
+    sky = _smooth_areas(shrunk(image, factor), places, high, shrunk(shown, factor) == 1) & high
     rows, columns = (
         np.minimum(np.arange(size) // factor, small - 1) for size, small in zip(image.shape[:2], sky.shape, strict=True)
     )
     return np.asarray(sky[np.ix_(rows, columns)])
 
 
-def _shrunk(image: np.ndarray, factor: int) -> np.ndarray:
+def shrunk(image: np.ndarray, factor: int) -> np.ndarray:
     """Average blocks of [H, W, ...]; incomplete blocks at two sides are dropped."""
     height, width = (max(1, size // factor) for size in image.shape[:2])
     high, wide = (min(factor, size) for size in image.shape[:2])

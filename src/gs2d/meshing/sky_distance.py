@@ -14,6 +14,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from gs2d.core.camera import Camera
+from gs2d.meshing.fusion_bounds import backproject
+from gs2d.meshing.sky import shrunk
 
 SIDE = 100  # px: images are reduced to this longer side, which also averages their noise
 SAMPLES = 200  # pixels of an image that are compared with each other image
@@ -41,18 +43,14 @@ def smooth_area(
 ) -> SmoothArea:
     """Return the ``sky`` pixels [H, W] of an image [H, W, 3] with the depths [M] of its sparse points [M, 2] px."""
     factor = max(1, round(max(sky.shape) / SIDE))
-    height, width = (size // factor for size in sky.shape)
-
-    def blocks(values: np.ndarray) -> np.ndarray:
-        cut = values[: height * factor, : width * factor]
-        return np.asarray(cut.reshape(height, factor, width, factor).mean(axis=(1, 3)))
-
+    inside = shrunk(sky, factor) == 1
+    height, width = inside.shape
     column, row = np.minimum(pixels / factor, (width - 1, height - 1)).astype(np.int64).T
     sparse = np.zeros((height, width))
     sparse[row, column] = depth
     nearest = distance_transform_edt(sparse == 0, return_distances=False, return_indices=True)
-    brightness = np.log(np.maximum(blocks(image.mean(axis=2)), DARKEST))
-    return SmoothArea(camera, factor, brightness, blocks(sky) == 1, sparse[tuple(nearest)])
+    brightness = np.log(np.maximum(shrunk(image, factor).mean(axis=2), DARKEST))
+    return SmoothArea(camera, factor, brightness, inside, sparse[tuple(nearest)])
 
 
 def at_infinity(areas: Sequence[SmoothArea]) -> bool:
@@ -67,26 +65,24 @@ def at_infinity(areas: Sequence[SmoothArea]) -> bool:
 
 
 def _matches(areas: Sequence[SmoothArea]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pixels and where another image shows them, at infinity and at their depth: (image, row, column) [M, 3]."""
+    """Return blocks and where another image shows them, at infinity and at their depth: (image, row, column) [M, 3]."""
     parts: list[tuple[np.ndarray, ...]] = []
     rng = np.random.default_rng(0)
     for index, area in enumerate(areas):
         row, column = np.nonzero(area.inside)
         some = rng.permutation(len(row))[:SAMPLES]
         row, column = row[some], column[some]
-        camera = area.camera
-        x, y = (column + 0.5) * area.factor, (row + 0.5) * area.factor
-        rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(len(x))], axis=1)
+        y, x = ((block + 0.5) * area.factor - 0.5 for block in (row, column))
+        points = backproject(area.camera, area.depth[row, column], y, x)
+        rays = points - area.camera.center
         for other, there in enumerate(areas):
             if other == index or not len(row):
                 continue
-            motion = there.camera.T_cam_world @ np.linalg.inv(camera.T_cam_world)
-            turned = rays @ motion[:3, :3].T
-            moved = turned * area.depth[row, column, None] + motion[:3, 3]
-            (far, inside_far), (near, inside_near) = _places(there, turned), _places(there, moved)
+            far, inside_far = _blocks_of(there, there.camera.center + rays)
+            near, inside_near = _blocks_of(there, points)
             fits = inside_far & inside_near & (np.linalg.norm(far - near, axis=1) > APART)
             here = np.stack([np.full(len(row), index), row, column], axis=1)[fits]
-            ends = (np.insert(places[fits], 0, other, axis=1) for places in (far, near))
+            ends = (np.insert(blocks[fits], 0, other, axis=1) for blocks in (far, near))
             parts.append((here, *ends))
     if not parts:
         return (np.zeros((0, 3), np.int64),) * 3
@@ -95,15 +91,13 @@ def _matches(areas: Sequence[SmoothArea]) -> tuple[np.ndarray, np.ndarray, np.nd
     return here[some], far[some], near[some]
 
 
-def _places(area: SmoothArea, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and columns [M, 2] of points [M, 3] of the camera's frame, and which are in the smooth area."""
-    camera, (height, width) = area.camera, area.inside.shape
-    z = np.maximum(points[:, 2], 1e-12)
-    row = np.floor((camera.fy * points[:, 1] / z + camera.cy) / area.factor)
-    column = np.floor((camera.fx * points[:, 0] / z + camera.cx) / area.factor)
-    shown = (points[:, 2] > 0) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    places = np.stack([np.where(shown, row, 0), np.where(shown, column, 0)], axis=1).astype(np.int64)
-    return places, shown & area.inside[places[:, 0], places[:, 1]]
+def _blocks_of(area: SmoothArea, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns [M, 2] of world points [M, 3], 0 outside the image, and which are in the smooth area."""
+    pixels, z = area.camera.project(points)
+    blocks = np.floor(pixels[:, ::-1] / area.factor)
+    shown = (z > 0) & (blocks >= 0).all(axis=1) & (blocks < area.inside.shape).all(axis=1)
+    blocks = np.where(shown[:, None], blocks, 0).astype(np.int64)
+    return blocks, shown & area.inside[tuple(blocks.T)]
 
 
 def _disagreement(areas: Sequence[SmoothArea], one: np.ndarray, two: np.ndarray) -> float:
