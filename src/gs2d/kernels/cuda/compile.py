@@ -126,9 +126,9 @@ def _supported_architectures() -> list[int]:
 def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
     """Compile one of :func:`source_names`, without the cache.
 
-    The architecture is ``"sm_90"`` or the like, or ``"compute_90"`` for PTX. ``options`` are those of NVRTC, without
-    the architecture. Raises BackendError if NVRTC is missing, does not know the architecture, or rejects the source
-    (with its first error).
+    The architecture is one of GPUs, such as ``"sm_90"``, or of PTX, such as ``"compute_90"``. ``options`` are those of
+    NVRTC, without the architecture. Raises BackendError if NVRTC is missing, does not know the architecture, or rejects
+    the source (with its first error).
     """
     files = sources()
     headers = {key: text for key, text in files.items() if key.endswith(".h")}
