@@ -10,7 +10,7 @@
 #   make kernels   build the native library in the source tree, for development with PYTHONPATH=src
 VENV := .venv
 PY := $(VENV)/bin/python
-PIP := $(PY) -m pip --disable-pip-version-check -q
+PIP_INSTALL := $(PY) scripts/pip_install.py
 # The first Python >= 3.11 found; `make PYTHON=/path/to/python` chooses another.
 PYTHON ?= $(shell for p in python3.14 python3.13 python3.12 python3.11 python3 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
@@ -75,13 +75,13 @@ clean:
 # The wheel as users get it (not editable): the tests test what is shipped. --no-build-isolation uses the pinned tools.
 $(VENV)/installed: $(VENV)/dependencies $(SOURCES)
 	@echo "compiling the kernels, minutes"
-	@PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP) install --no-deps --no-build-isolation --force-reinstall .
+	@PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP_INSTALL) --no-deps --no-build-isolation --force-reinstall .
 	@touch $@
 
 $(VENV)/docs: $(VENV)/dependencies
 	$(PY) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
 		print(*p["optional-dependencies"]["docs"], sep="\n")' > $(VENV)/docs-requirements.txt
-	$(PIP) install -c constraints.txt -r $(VENV)/docs-requirements.txt
+	$(PIP_INSTALL) -c constraints.txt -r $(VENV)/docs-requirements.txt
 	@touch $@
 
 $(VENV)/dependencies: constraints.txt pyproject.toml
@@ -94,5 +94,5 @@ $(VENV)/dependencies: constraints.txt pyproject.toml
 		*p["dependencies"], *p["optional-dependencies"]["dev"], sep="\n")' > $(VENV)/requirements.txt
 	@echo "downloading the dependencies into $(VENV), minutes: on Linux 5 GB, as torch brings CUDA;" \
 		"without a GPU see docs/guides/install.md#make"
-	@$(PIP) install --no-compile -c constraints.txt -r $(VENV)/requirements.txt
+	@$(PIP_INSTALL) --no-compile -c constraints.txt -r $(VENV)/requirements.txt
 	@touch $@

@@ -17,8 +17,10 @@ from PIL import Image
 
 from benchmarks.mesh_images import mesh_images
 from gs2d.core.camera import Camera
-from gs2d.data.image_files import write_image
+from gs2d.core.atomic_files import atomic_write
 from gs2d.io.meshes import read_mesh
+
+KINDS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WEBP"}
 
 
 def views_of(run: Path) -> int:
@@ -57,10 +59,13 @@ def main() -> None:
     parser.add_argument("--stage")
     parser.add_argument("--size", type=int, default=300)
     args = parser.parse_args()
+    if args.out.suffix.lower() not in KINDS:
+        parser.error(f"OUT must end in {', '.join(KINDS)}, got {args.out}")
     rows = [np.concatenate(strip(run, args.view, args.stage, args.size), axis=1) for run in args.runs]
     image = np.concatenate(rows, axis=0)
     used = np.flatnonzero((image != 255).any(axis=(1, 2)))  # crop white margins above and below
-    write_image(args.out, image[used[0] : used[-1] + 1])
+    with atomic_write(args.out) as file:
+        Image.fromarray(image[used[0] : used[-1] + 1]).save(file, format=KINDS[args.out.suffix.lower()], quality=92)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import builtins
 import re
+import symtable
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +115,27 @@ def test_citation_and_changelog_have_the_current_version() -> None:
     released = re.findall(r"^## \[(.*)\] - (.*)$", changelog, re.M)
     assert released[0] == (dated[1], dated[2])
     assert re.findall(r"^## (.*)$", changelog, re.M)[0] == "[Unreleased]"
+
+
+def free_names(table: symtable.SymbolTable) -> set[str]:
+    """Return the names that a block of code uses and does not define."""
+    used = {symbol.get_name() for symbol in table.get_symbols() if symbol.is_referenced() and symbol.is_global()}
+    if table.get_type() == "module":
+        used = {symbol.get_name() for symbol in table.get_symbols() if symbol.is_referenced()}
+    used = used.union(*map(free_names, table.get_children()))
+    if table.get_type() != "module":
+        return used
+    made = {one.get_name() for one in table.get_symbols() if one.is_assigned() or one.is_imported()}
+    return used - made - set(dir(builtins))
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))], ids=lambda page: page.stem)
+def test_a_python_block_is_complete_or_names_the_blocks_that_it_needs(page: Path) -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+    if page.stem == "extending":  # parts of one file, whose imports the page shows first
+        return
+    free = {block.partition("\n")[0]: free_names(symtable.symtable(block, str(page), "exec")) for block in blocks}
+    assert {line: names for line, names in free.items() if names and not line.startswith("# continues ")} == {}
 
 
 # Options, defaults and files on the user pages are compared with the program.

@@ -10,6 +10,7 @@ import pytest
 
 from gs2d.cli import run
 from gs2d.core.extras import EXTRAS, install
+from gs2d.render.backends import BackendStatus
 
 ROOT = Path(__file__).parents[2]
 
@@ -36,3 +37,21 @@ def test_doctor_checks_the_requirements_of_every_command(
     assert "no   textured meshes (--texture): xatlas missing\n       to get it: pip install 'xatlas" in text
     ffmpeg = "no   videos, read and written (gs2d render --video x.mp4): ffmpeg, ffprobe missing"
     assert f"{ffmpeg}\n       to get it: apt" in text
+
+
+def test_doctor_ends_with_whether_the_machine_can_train_and_the_next_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cuda = BackendStatus("cuda", False, "no GPU", "install one", "")
+    cpu, slow = BackendStatus("cpu", True, "", "", "2 threads"), BackendStatus("reference", True, "", "", "slow")
+    monkeypatch.setattr("gs2d.render.backends.backend_report", lambda: (cuda, cpu, slow))
+    assert run(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines if line.startswith(("  yes", "  no"))][:3] == ["cpu:", "reference:", "cuda:"]
+    assert lines[-1] == "Ready for gs2d train (cpu). Try it: gs2d demo"
+    broken = BackendStatus("cpu", False, "no library", "install a compiler", "")
+    monkeypatch.setattr("gs2d.render.backends.backend_report", lambda: (cuda, broken, slow))
+    assert run(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2].startswith("Not ready for gs2d train: ")
+    assert lines[-1] == "First: install a compiler"

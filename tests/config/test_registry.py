@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.config.registry import Registry
+from gs2d.config.registry import Registry, origin_of
 from gs2d.errors import PluginWarning, RecipeError
+from gs2d.pipeline.attempts import reason_of
 
 
 def offer(folder: Path, package: str, entries: str, code: str) -> None:
@@ -85,3 +86,16 @@ def test_of_a_name_that_is_taken_the_first_keeps_it_and_one_line_says_so(folder:
         "b-guest 1.5 declares the dish 'soup' of gs2d; it is ignored",
         "b-guest 1.5 declares the dish 'stew' of a-guest 1.5; it is ignored",
     ]
+
+
+def test_an_error_out_of_a_package_names_the_package(folder: Path) -> None:
+    code = "class Stew:\n    def cook(self):\n        return 1 / 0\nclass Other(Stew): ...\n"
+    offer(folder, "burnt-guest", "other = burnt_guest:Other\nstew = burnt_guest:Stew", code)
+    dishes: Registry[type] = registry()  # type: ignore[assignment]
+    with pytest.raises(ZeroDivisionError) as raised:
+        (dishes.get("other"), dishes.get("stew"))[1]().cook()
+    assert origin_of(raised.value) == "dish 'stew' of burnt-guest 1.5"
+    assert reason_of(raised.value).startswith("fault in dish 'stew' of burnt-guest 1.5: ZeroDivisionError")
+    with pytest.raises(RecipeError) as ours:
+        dishes.get("soop")
+    assert origin_of(ours.value) == "gs2d"

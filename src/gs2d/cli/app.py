@@ -24,6 +24,7 @@ from gs2d.cli.commands import COMMANDS, Common, DoctorCommand, InfoCommand, Reci
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
+from gs2d.config.registry import origin_of
 from gs2d.core.memory_limit import address_space
 from gs2d.core.processes import process_rank
 from gs2d.core.text import printable
@@ -175,7 +176,7 @@ def _report(error: Exception, verbose: bool) -> int:
         return _fail("out of memory; use a larger --downscale, or fewer splats (--set STAGE.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
     hint = "" if verbose else "; run again with --verbose and report it with the traceback"
-    _print_error(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}")
+    _print_error(f"fault in {origin_of(error)}: {type(error).__name__}: {text[:500]}{hint}")
     return EXIT_BUG
 
 

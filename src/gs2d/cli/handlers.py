@@ -184,7 +184,7 @@ def view(command: c.ViewCommand, console: Console) -> None:
 
     server, shown = open_viewer(command.path, command.port, console.on_event)
     try:
-        console.say(f"{server.url}  (Ctrl-C ends it)")
+        console.say(f"open in a browser: {server.url}  (Ctrl-C ends it)")
         console.result({"url": server.url, "port": server.port, "shown": shown})
         console.flush()
         serve(server, console.on_event)
@@ -327,11 +327,17 @@ def doctor(_command: c.DoctorCommand, console: Console) -> None:
     console.say(f"{host['processor']}, {host['cores']} cores, {host['system']}")
     console.say(", ".join(f"{name} {version}" for name, version in installed.items()))
     console.say(f"\nRasterizers (--backend auto takes: {chosen})", style="bold")
-    for status in backends:
+    for status in sorted(backends, key=lambda status: not status.available):
         _show(console, status.name, status.available, status.details or status.reason, status.remedy)
     console.say("\nFor some commands", style="bold")
     for entry in optional.values():
         _show(console, entry["used_by"], entry["available"], entry["details"], entry["remedy"])
+    remedy = next((status.remedy for status in backends if status.name == "cpu"), "")
+    if chosen == "reference":
+        console.say("\nNot ready for gs2d train: only the reference rasterizer runs, which is far too slow", style="bold")
+        console.say(f"First: {remedy}")
+    else:
+        console.say(f"\nReady for gs2d train ({chosen}). Try it: gs2d demo", style="bold")
     fields = ("name", "available", "reason", "remedy", "details")
     console.result(
         {

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import functools
 import tomllib
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,13 +23,14 @@ from typing import Any, Generic, TypeVar
 
 from gs2d.errors import Gs2dError, PluginWarning
 
-__all__ = ["Register", "Registry", "absent_guests", "did_you_mean"]
+__all__ = ["Register", "Registry", "absent_guests", "did_you_mean", "origin_of"]
 
 T = TypeVar("T")
 Register = TypeVar("Register")
 _ABSENT = ContextVar("absent guests", default=False)
 _PACKAGE = Path(__file__).resolve().parents[1]
 _DISTRIBUTION, _CONTRIB = "2dgs-r", "gs2d.contrib."
+_REGISTRIES: list[Registry[Any]] = []
 
 
 @contextmanager
@@ -60,6 +62,7 @@ class Registry(Generic[T]):
         self.what, self.group, self._error = what, group, error
         self._core = {} if builtin is None else dict(builtin)
         self._objects: dict[str, T] = {}
+        _REGISTRIES.append(self)
 
     @cached_property
     def _homes(self) -> dict[str, str]:
@@ -199,6 +202,19 @@ class Registry(Generic[T]):
                 f"{type(error).__name__}: {reason}; fix or uninstall that package"
             ) from error
         return self._objects.setdefault(name, loaded)
+
+
+def origin_of(error: BaseException) -> str:
+    """Return whose code raised an error: "loss 'tint' of example 1.0" if the traceback passes a plug-in, or "gs2d"."""
+    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
+        module, scope = frame.f_globals.get("__name__"), f"{frame.f_code.co_qualname}."
+        for registry in _REGISTRIES:
+            for name in registry.guests():
+                entry: Any = registry._objects.get(name)
+                home, qualname = getattr(entry, "__module__", ""), getattr(entry, "__qualname__", "")
+                if home == module and scope.startswith(f"{qualname}."):
+                    return f"{registry.what} {name!r} of {registry.source(name)}"
+    return "gs2d"
 
 
 @functools.cache

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
+from gs2d.config.registry import origin_of
 from gs2d.core.atomic_files import is_full
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import MESH, PAGE, REPORT, TEXTURED, VERDICT, RunFolder
@@ -54,10 +55,10 @@ def attempted_file(run: RunFolder, name: str, on_event: OnEvent) -> AbstractCont
 
 
 def reason_of(error: Exception) -> str:
-    """Return an error in one line; an unexpected one is marked as a fault of gs2d."""
+    """Return an error in one line; an unexpected one is a fault of gs2d or of a plug-in."""
     text = " ".join(str(error).split())
     if isinstance(error, Gs2dError):
         return text
     if isinstance(error, MemoryError):
         return "out of memory"
-    return f"fault in gs2d: {type(error).__name__}: {text[:LONGEST] or 'no message'}"
+    return f"fault in {origin_of(error)}: {type(error).__name__}: {text[:LONGEST] or 'no message'}"

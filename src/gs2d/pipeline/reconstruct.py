@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,6 +46,14 @@ from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_wo
 from gs2d.training.events import Notice, OnEvent, ignore
 
 CAPTURE = "capture"
+_PLAIN = re.compile(r"(images?|input|frames|rgb|photos?|photographs)(_\d+)?", re.IGNORECASE)
+
+
+def capture_title(photos: Path) -> str:
+    """Return the title of a reconstruction: the name of the video or folder, of the folder above for "images"."""
+    if is_video(photos):
+        return photos.stem
+    return photos.parent.name or photos.name if _PLAIN.fullmatch(photos.name) else photos.name
 
 
 def poses_options(options: ReconstructOptions) -> PosesOptions:
@@ -80,8 +89,8 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
                 RunFolder(options.out).clear()
         for line in (f"{placed_line(poses)}; {capture / POSES_PNG} shows them", *lost_lines(poses)):
             on_event(Notice(line))
-    training, photos = replace(train_options(options), overwrite=False), options.photos.resolve()
-    run = train(training, on_event, title=photos.stem if is_video(photos) else photos.name, allowed=_allowed(options))
+    training = replace(train_options(options), overwrite=False)
+    run = train(training, on_event, title=capture_title(options.photos.resolve()), allowed=_allowed(options))
     if options.texture and not run.file(TEXTURED).exists():
         with attempted_file(run, TEXTURED, on_event):
             if not run.file(MESH).exists():
