@@ -16,8 +16,8 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.mesh_images import mesh_images
-from gs2d.core.camera import Camera
 from gs2d.core.atomic_files import atomic_write
+from gs2d.core.camera import Camera
 from gs2d.io.meshes import read_mesh
 
 KINDS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WEBP"}

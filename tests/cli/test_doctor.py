@@ -47,7 +47,8 @@ def test_doctor_ends_with_whether_the_machine_can_train_and_the_next_command(
     monkeypatch.setattr("gs2d.render.backends.backend_report", lambda: (cuda, cpu, slow))
     assert run(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[1] for line in lines if line.startswith(("  yes", "  no"))][:3] == ["cpu:", "reference:", "cuda:"]
+    shown = [line.split()[1] for line in lines if line.startswith(("  yes", "  no"))]
+    assert shown[:3] == ["cpu:", "reference:", "cuda:"]
     assert lines[-1] == "Ready for gs2d train (cpu). Try it: gs2d demo"
     broken = BackendStatus("cpu", False, "no library", "install a compiler", "")
     monkeypatch.setattr("gs2d.render.backends.backend_report", lambda: (cuda, broken, slow))

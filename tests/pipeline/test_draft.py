@@ -16,7 +16,7 @@ from gs2d.errors import RecipeError
 from gs2d.pipeline.prepare.open_capture import FEW, OpenCapture, QualityLevel, open_capture
 from gs2d.pipeline.prepare.options import ReconstructOptions, TrainOptions
 from gs2d.pipeline.prepare.resolve import schedule_scale_of
-from gs2d.pipeline.reconstruct import CAPTURE, train_options
+from gs2d.pipeline.reconstruct import CAPTURE, capture_title, train_options
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, ignore
 
@@ -70,3 +70,8 @@ def test_an_unknown_quality_is_an_error_and_leaves_nothing(capture: Path, tmp_pa
     with pytest.raises(RecipeError, match="--quality"):
         train(options(capture, tmp_path / "run", quality="best"))
     assert not (tmp_path / "run").exists()
+
+
+def test_the_title_is_the_name_of_the_capture_and_not_of_its_folder_of_photographs() -> None:
+    titles = {"a/skull": "skull", "a/skull/images": "skull", "a/skull/images_4": "skull", "a/walk.mp4": "walk"}
+    assert {path: capture_title(Path(path)) for path in titles} == titles

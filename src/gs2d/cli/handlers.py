@@ -334,7 +334,7 @@ def doctor(_command: c.DoctorCommand, console: Console) -> None:
         _show(console, entry["used_by"], entry["available"], entry["details"], entry["remedy"])
     remedy = next((status.remedy for status in backends if status.name == "cpu"), "")
     if chosen == "reference":
-        console.say("\nNot ready for gs2d train: only the reference rasterizer runs, which is far too slow", style="bold")
+        console.say("\nNot ready for gs2d train: only the slow reference rasterizer runs", style="bold")
         console.say(f"First: {remedy}")
     else:
         console.say(f"\nReady for gs2d train ({chosen}). Try it: gs2d demo", style="bold")
