@@ -8,6 +8,9 @@
     python -m benchmarks.gpu kernels     [--out FILE.json] [--dry-run] [--only 1000000 ...]
     python -m benchmarks.gpu real        [--out FILE.json] [--dry-run] --capture FOLDER ... [--recipe best]
                                          [--schedule-scale 1.0] [--downscale 1]
+    python -m benchmarks.gpu peers       [--out FILE.json] [--dry-run] --capture FOLDER [--only gsplat ...]
+                                         [--trainer 'NAME=COMMAND {capture} {out}' ...] [--schedule-scale 1.0]
+                                         [--downscale 1] [--runs FOLDER]
     python -m benchmarks.gpu training    [--out FILE.json] [--dry-run] --capture FOLDER ... [--schedule-scale 1.0]
                                          [--downscale 1] [--runs FOLDER] [--synthetic]
 
@@ -20,9 +23,11 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
 import math
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +37,7 @@ if TYPE_CHECKING:
     from benchmarks.gpu.bench import Bench
 
 NEEDED = ("torch", "numpy", "scipy", "PIL")
+COMMANDS = ("first", "correctness", "kernels", "training", "real", "peers", "exercise", "host")
 
 
 def unfit() -> str:
@@ -53,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.gpu", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("command", choices=("first", "correctness", "kernels", "training", "real", "exercise", "host"))
+    parser.add_argument("command", choices=COMMANDS)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--dry-run", action="store_true")
     parser.add_argument(
@@ -66,9 +72,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--recipe", default="best", help="recipe of the command real")
     parser.add_argument("--schedule-scale", type=float, default=1.0)
     parser.add_argument("--downscale", type=int, default=1)
-    parser.add_argument("--runs", type=Path, help="keep the run folders here")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="start no part after this many minutes")
+    parser.add_argument("--runs", type=Path, help="keep the run folders here; of peers, the splats")
+    parser.add_argument(
+        "--trainer", nargs="+", default=[], metavar="NAME=COMMAND", help="trainings of the command peers"
+    )
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # a part of the command peers, in this process
+    parser.add_argument("--minutes", type=float, help="start no part after this many minutes (peers: 25)")
     args = parser.parse_args(arguments)
+    if args.minutes is None:
+        args.minutes = 25.0 if args.command == "peers" else math.inf
+    if args.command == "peers" and not args.dry_run and len(args.capture) != 1:
+        parser.error("peers needs --capture FOLDER, one")
+    if any("=" not in trainer for trainer in args.trainer):
+        parser.error("--trainer needs NAME=COMMAND")
     if args.command == "training" and not args.capture and not args.dry_run and not args.synthetic:
         parser.error("training needs --capture FOLDER or --synthetic")
     if args.command == "real" and not args.capture:
@@ -121,7 +137,12 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
     def progress(results: dict[str, Any]) -> None:
         write(out, {**document, "results": results})
 
-    progress({})  # detect an unwritable path before anything slow runs
+    earlier: dict[str, Any] = {}
+    if args.command == "peers" and args.one is None:
+        document["capture"] = [str(each) for each in args.capture]
+        written = json.loads(out.read_text()) if out.exists() else {}
+        earlier = written.get("results", {}) if written.get("capture") == document["capture"] else {}
+    progress(earlier)  # detect an unwritable path before anything slow runs
     module: ModuleType
     if args.command == "first":
         results, module = first.run(bench, args.only, progress), first
@@ -134,6 +155,10 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
 
         given = (args.capture, args.recipe, args.schedule_scale, args.downscale)
         results, module = real.run(bench, *given, progress), real
+    elif args.command == "peers":
+        from benchmarks.gpu import beside
+
+        results, module = peers(args, bench, earlier, progress), beside
     else:
         from benchmarks.gpu import training  # imported here: only this command needs the pipeline
 
@@ -147,6 +172,20 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
         args.command == "first" and first.wrong(results)
     )
     return int(wrong and not bench.dry)
+
+
+def peers(args: argparse.Namespace, bench: Bench, earlier: dict[str, Any], progress: Any) -> dict[str, Any]:
+    """Measure all rasterizers on a capture, or with ``--one`` one of them in this process."""
+    from benchmarks.gpu import beside
+    from benchmarks.gpu.training import toy_capture
+
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = args.runs or Path(temporary) / "splats"
+        capture = args.capture[0] if args.capture else toy_capture(Path(temporary))
+        sizes = 0.0005 if bench.dry else args.schedule_scale, args.downscale
+        if args.one is not None:
+            return beside.measure(bench, args.one, capture, sizes, folder, progress)
+        return beside.run(bench, capture, sizes, folder, args.only, args.trainer, earlier, progress)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 #!/bin/bash
-# Run the GPU measurements in four calls, for machines with limited time (METHOD.md). Run part 0 first.
+# Run the GPU measurements in five calls, for machines with limited time (METHOD.md). Run part 0 first.
 #
 #   bash benchmarks/gpu/lent.sh 0 OUT                three minutes: machine, every kernel once, parity, time breakdown
 #   bash benchmarks/gpu/lent.sh 1 OUT                kernels and iterations, counters, comparison with gsplat
 #   bash benchmarks/gpu/lent.sh 2 OUT [CAPTURE ...]  whole runs of captures and of a synthetic capture
 #   bash benchmarks/gpu/lent.sh 3 OUT                ceilings, parity, tests, sanitizers if time allows
+#   bash benchmarks/gpu/lent.sh 4 OUT [CAPTURE]      all installed rasterizers on a capture; call it again for the rest
 #
 # Results are written to OUT/gpu_*.json after every measurement. Reports, traces and logs are packed into
 # OUT/part_N.tar.gz. Each part thus leaves two small files and no folders. The script needs no package index and installs
@@ -15,7 +16,7 @@ begun=$(date +%s)
 set -u
 cd "$(dirname "$0")/../.." || exit 2
 part=${1:-}; out=${2:-}
-case "$part" in 0 | 1 | 2 | 3) ;; *) sed -n '2,7s/^# \{0,1\}//p' "$0" >&2; exit 2 ;; esac
+case "$part" in 0 | 1 | 2 | 3 | 4) ;; *) sed -n '2,8s/^# \{0,1\}//p' "$0" >&2; exit 2 ;; esac
 [ -n "$out" ] && mkdir -p "$out" || { echo "error: lent.sh: a folder for results was expected after the part, got '$out'" >&2; exit 2; }
 out=$(cd "$out" && pwd)
 shift 2
@@ -78,4 +79,10 @@ case "$part" in
         measure training --runs "$work/runs" --out "$out/gpu_training.json" --synthetic --capture ${captures[@]+"${captures[@]}"}
         ;;
     3) measure correctness --out "$out/gpu_correctness.json" ;;
+    4)
+        export TORCH_EXTENSIONS_DIR="$work/.extensions"
+        captures=("$@")
+        [ $# -gt 0 ] || for folder in carried/captures/*/; do [ -d "$folder" ] && captures=("$folder") && break; done
+        measure peers --out "$out/gpu_peers.json" --runs "$work/.splats" --capture ${captures[@]+"${captures[@]}"}
+        ;;
 esac

@@ -25,7 +25,7 @@ def lent(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["0", "1", "2", "3"])
+@pytest.mark.parametrize("part", ["0", "1", "2", "3", "4"])
 def test_a_dry_run_of_each_part_leaves_two_files_and_no_folder(part: str, tmp_path: Path) -> None:
     """Eight files, none more than two folders down, come home from a machine that is lent."""
     done = lent(part, str(tmp_path), DRY="--dry-run", GS2D_COMMIT="abc", MINUTES="2" if part == "2" else "0")
