@@ -31,6 +31,7 @@ def test_doctor_checks_the_requirements_of_every_command(
     report = json.loads(capsys.readouterr().out)
     missing = {name for name, entry in report["optional"].items() if not entry["available"]}
     assert missing == {"ffmpeg", "texture"}
+    assert report["optional"]["sfm"]["details"].startswith("pycolmap 1.2.3; features on the ")
     assert report["optional"]["heic"]["details"] == "pillow-heif 1.2.3"
     assert run(["doctor"]) == 0
     text = capsys.readouterr().out

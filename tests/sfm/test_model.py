@@ -6,6 +6,7 @@ import importlib.metadata
 import importlib.util
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from gs2d.data.readers.colmap import ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.sfm.colmap_process import MatchCounts, Request, check_installed, solve
+from gs2d.sfm.compare import device_of
 from gs2d.sfm.model import SfmModel, why_not_placed
 from gs2d.sfm.workspace import check_out, put_in_place, workspace
 
@@ -92,6 +94,32 @@ def test_a_failing_worker_is_a_one_line_error(tmp_path: Path, code: str, expecte
     with pytest.raises(DataError, match=expected) as caught:
         follow(tmp_path, code)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("end", ["os.kill(os.getpid(), 6)", "raise RuntimeError('no CUDA-capable device')"])
+def test_a_failure_on_the_gpu_is_repeated_on_the_cpu(tmp_path: Path, end: str) -> None:
+    code = (
+        "import json, os, sys\ndef say(**m): print(json.dumps(m), flush=True)\n"
+        "on_cpu = json.load(open(sys.argv[1])).get('on_cpu')\n"
+        f"if not on_cpu:\n say(gpu=True); say(phase='features', total=3); {end}\n"
+        "say(models=[])"
+    )
+    notes: list[str] = []
+    words = (sys.executable, "-c", code)
+    assert solve(request(tmp_path), lambda *step: None, notes.append, command=words) == {"models": []}
+    assert len(notes) == 1
+    assert "while finding features" in notes[0]
+    assert notes[0].endswith("on the GPU; continuing on the CPU")
+    late = code.replace("'features'", "'cameras'").replace("if not on_cpu", "if True")
+    with pytest.raises(DataError, match="while placing cameras"):  # placing cameras does not use the GPU
+        solve(request(tmp_path), lambda *step: None, command=(sys.executable, "-c", late))
+
+
+def test_features_are_on_the_gpu_where_colmap_was_built_for_it_until_that_failed() -> None:
+    def chosen(cuda: bool, **asked: bool) -> str:
+        return str(device_of(SimpleNamespace(has_cuda=cuda, Device=SimpleNamespace(cpu="cpu", cuda="cuda")), asked))
+
+    assert [chosen(False), chosen(True), chosen(True, on_cpu=True)] == ["cpu", "cuda", "cpu"]
 
 
 def test_without_pycolmap_the_error_names_the_extra(

@@ -6,6 +6,8 @@ import importlib.metadata
 import json
 import shlex
 import shutil
+import subprocess
+import sys
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -361,11 +363,20 @@ def _optional() -> dict[str, dict[str, Any]]:
     entries = {}
     for extra, (used_by, packages) in _EXTRAS.items():
         entries[extra] = _entry(used_by, {name: _version(name) for name in packages}, install(extra))
+    if entries["sfm"]["available"]:
+        entries["sfm"]["details"] += f"; features on the {_colmap_device()}"
     heic = next((name for name in ("pi-heif", "pillow-heif") if _version(name) is not None), "pi-heif")
     entries["heic"] = _entry("HEIC photographs (iPhone)", {heic: _version(heic)}, _HEIC)
     programs = {name: shutil.which(name) for name in ("ffmpeg", "ffprobe")}
     entries["ffmpeg"] = _entry("videos, read and written (gs2d render --video x.mp4)", programs, FFMPEG)
     return entries
+
+
+def _colmap_device() -> str:
+    """Return where COLMAP finds features; asked in a process of its own, as pycolmap loads another OpenMP library."""
+    words = [sys.executable, "-c", "import pycolmap; print(pycolmap.has_cuda)"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return "GPU, or the CPU if that fails" if done.stdout.strip() == "True" else "CPU (this pycolmap has no CUDA)"
 
 
 def _entry(used_by: str, installed: dict[str, str | None], remedy: str) -> dict[str, Any]:

@@ -32,6 +32,7 @@ _LITTLE_SPACE = 64 << 20  # bytes; SQLite frees what it could not finish writing
 _WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.colmap_worker import main; main(sys.argv[1])"
 _PAIRS = "two_view_geometries"
 _COUNTED = {"features": "keypoints", "matching": _PAIRS, "verifying": _PAIRS}  # tables with one row per step
+_ON_GPU = ("", "features", "comparing", "matching")  # phases in which a failure may be the GPU's
 _PHASES = {
     "features": "finding features",
     "comparing": "finding similar photographs",
@@ -66,8 +67,21 @@ def solve(
     """Estimate the cameras; return what ``colmap_worker.map_`` does.
 
     ``command``: command line of the worker, without the request (default: ``colmap_worker``). Raises DataError if the
-    worker failed or crashed; with the phase and its last line.
+    worker failed or crashed; with the phase and its last line. A worker that fails on the GPU, where a driver may be
+    missing, is started again on the CPU and continues with what is in the database.
     """
+    try:
+        return _solve(request, on_progress, on_note, command)
+    except _GpuError as error:
+        on_note(f"{str(error).rpartition('; ')[0]} on the GPU; continuing on the CPU")
+    return _solve({**request, "on_cpu": True}, on_progress, on_note, command)
+
+
+class _GpuError(DataError):
+    """The worker failed while it used the GPU."""
+
+
+def _solve(request: Request, on_progress: OnProgress, on_note: OnNote, command: Sequence[str]) -> dict[str, Any]:
     work = Path(request["database"]).parent
     with atomic_write(work / "request.json", "w") as file:
         json.dump(request, file)
@@ -79,7 +93,7 @@ def solve(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=environment, encoding="utf-8"
         )
         try:
-            solved, phase = _follow(process, Path(request["database"]), on_progress, on_note)
+            solved, phase, on_gpu = _follow(process, Path(request["database"]), on_progress, on_note)
         finally:
             process.kill()
             process.wait()
@@ -87,20 +101,21 @@ def solve(
                 if pipe is not None:
                     pipe.close()
     if solved is None:
-        raise DataError(_last_words(phase, process.returncode, work / "worker.log"))
+        failure = _GpuError if on_gpu and phase in _ON_GPU else DataError
+        raise failure(_last_words(phase, process.returncode, work / "worker.log"))
     return solved
 
 
 def _follow(
     process: subprocess.Popen[str], database: Path, on_progress: OnProgress, on_note: OnNote
-) -> tuple[dict[str, Any] | None, str]:
-    """Report progress until the worker ends; returns its result, if any, and its last phase."""
+) -> tuple[dict[str, Any] | None, str, bool]:
+    """Report progress until the worker ends; returns its result, if any, its last phase, and if it uses the GPU."""
     lines: queue.Queue[str | None] = queue.Queue()
     assert process.stdout is not None
     reader = threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True)
     reader.start()
     phase, total, before = "", 0, 0
-    solved = None
+    solved, on_gpu = None, False
     while True:
         try:
             line = lines.get(timeout=POLL_SECONDS)
@@ -112,10 +127,11 @@ def _follow(
         if line is None:
             process.wait()
             reader.join()
-            return solved, phase
+            return solved, phase, on_gpu
         message = json.loads(line)
         if "models" in message:
             solved = message
+        on_gpu |= "gpu" in message
         if "note" in message:
             on_note(message["note"])
         if "phase" in message:

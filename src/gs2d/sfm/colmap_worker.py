@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.similarity import rotation_to_z
-from gs2d.sfm.compare import find_features, match
+from gs2d.sfm.compare import device_of, find_features, match
 from gs2d.sfm.lens import PANORAMA, RICH, START, settle_fisheyes, with_rich_lenses
 from gs2d.sfm.mapping import Steps, extend, map_globally, map_incrementally
 from gs2d.sfm.search import FISHEYES, MAPPING
@@ -69,6 +69,8 @@ def main(request_path: str) -> None:
     pycolmap.set_random_seed(request["seed"])
     steps = Steps(Path(request["database"]).with_name(MAPPING))
     if steps.result("first") is None:
+        if device_of(pycolmap, request) != pycolmap.Device.cpu:
+            say(gpu=True)
         find_features(pycolmap, request, say)
         match(pycolmap, request, say)
     say(**map_(pycolmap, request, steps, say))

@@ -25,6 +25,11 @@ ALIKE = "alike.json"  # beside the database: pairs of similar images
 LESS_NEXT, LESS_ALIKE = 3, 4  # divisors for consecutive and similar images if positions are available (notebook/sfm.md)
 
 
+def device_of(pycolmap: Any, request: Mapping[str, Any]) -> Any:
+    """Return where features are found and matched: on the GPU if this build can, unless that failed before."""
+    return pycolmap.Device.cuda if pycolmap.has_cuda and not request.get("on_cpu") else pycolmap.Device.cpu
+
+
 def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
     """Write SIFT features of all images to the database. Each group of images shares a camera.
 
@@ -43,7 +48,7 @@ def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
         options.max_image_size = finer * request["feature_size"]
         groups = [group for group in request["groups"] if (group["camera_model"] == PANORAMA) is (finer == FINER)]
         if names := [name for group in groups for name in group["names"]]:
-            pycolmap.extract_features(database, images, names, mode, reader, options, pycolmap.Device.cpu)
+            pycolmap.extract_features(database, images, names, mode, reader, options, device_of(pycolmap, request))
 
 
 def _count_images(database: str) -> int:
@@ -92,12 +97,12 @@ def match(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
     matching.num_threads = request["threads"]
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = request["seed"]
-    database, cpu = request["database"], pycolmap.Device.cpu
+    database, device = request["database"], device_of(pycolmap, request)
     names = request["in_order"]
     if request["matching"] == "exhaustive":
         say(phase="matching", total=len(names) * (len(names) - 1) // 2)
         pairing = pycolmap.ExhaustivePairingOptions()
-        pycolmap.match_exhaustive(database, matching, pairing, verification, cpu)
+        pycolmap.match_exhaustive(database, matching, pairing, verification, device)
         return
     reasons = _pairs(pycolmap, request, say)
     pairs = sorted(set().union(*reasons.values()))
@@ -106,7 +111,7 @@ def match(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
     listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), encoding="utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)
-    pycolmap.match_image_pairs(database, matching, pairing, verification, cpu)
+    pycolmap.match_image_pairs(database, matching, pairing, verification, device)
 
 
 def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> dict[str, set[tuple[int, int]]]:
