@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+import torch
 
 from gs2d.core.camera import Camera, look_at
+from gs2d.core.splats import Splats
 from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
+from train_toys import random_splats
 
 WALL = 4.0  # the wall is the plane z = 4; cameras stand at z = 0 and look along z
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
@@ -54,3 +58,13 @@ def wall(gains: tuple[float, ...] = (1.0,) * 5) -> Scene:
     observed = ObservedPoints(points, np.full(300, 0.5), np.full(300, 5), seen)
     bounds = np.array([[-2.0, -2, 0], [2, 2, 5]])
     return Scene("wall", "colmap", views, (), PointCloud(points), 1.0, bounds, observe=lambda: observed)
+
+
+def flat_wall() -> Splats:
+    """Return splats on the wall that cover all images."""
+    x, y = torch.meshgrid(torch.arange(-4, 4, 0.25), torch.arange(-3, 3, 0.25), indexing="xy")
+    splats = random_splats(x.numel())
+    splats.means[:] = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((x.numel(),), WALL)], dim=1)
+    splats.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    splats.log_scales[:], splats.opacity_logits[:] = math.log(0.2), 6.0
+    return splats

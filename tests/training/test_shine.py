@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -26,17 +25,7 @@ from gs2d.training.trainer import Trainer, TrainerOptions
 from saved_states import resumed_everywhere
 from together import robust
 from train_toys import full_state, random_splats
-from wall_scene import HEIGHT, WALL, WIDTH, wall
-
-
-def flat_wall() -> Splats:
-    """Return splats on the wall that cover all images."""
-    x, y = torch.meshgrid(torch.arange(-4, 4, 0.25), torch.arange(-3, 3, 0.25), indexing="xy")
-    splats = random_splats(x.numel())
-    splats.means[:] = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((x.numel(),), WALL)], dim=1)
-    splats.quats[:] = torch.tensor([1.0, 0, 0, 0])
-    splats.log_scales[:], splats.opacity_logits[:] = math.log(0.2), 6.0
-    return splats
+from wall_scene import HEIGHT, WALL, WIDTH, flat_wall, wall
 
 
 def on_the_wall(camera: Camera) -> np.ndarray:
@@ -90,23 +79,22 @@ def test_exposure_is_not_shine_and_photographs_without_neighbours_are_matt() -> 
 def test_shiny_pixels_count_as_pixels_without_texture() -> None:
     state, flat = full_state(), torch.full((8, 12), 40, dtype=torch.uint8)
     assert state.bare(0, flat) is flat
-    state.shine = torch.zeros((2, CELLS, CELLS), dtype=torch.uint8)
-    state.shine[1, :, : CELLS // 2] = 200
+    state.maps["shine"] = torch.zeros((2, CELLS, CELLS), dtype=torch.uint8)
+    state.maps["shine"][1, :, : CELLS // 2] = 200
     assert state.bare(1, None) is None
     assert torch.equal(state.bare(0, flat), flat)
     both = state.bare(1, flat)
     assert both.dtype == torch.uint8
     assert (both[:, :5] == 200).all()
     assert (both[:, 7:] == 40).all()
-    assert torch.equal(TrainState.from_state_dict(state.state_dict()).shine, state.shine)
+    assert torch.equal(TrainState.from_state_dict(state.state_dict()).maps["shine"], state.maps["shine"])
 
 
 def test_training_finds_shine_and_resumes_with_it() -> None:
     recipe, scene = robust(), with_reflection(wall())
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", init=flat_wall())
     trainer.run()
-    assert trainer.state.shine is not None
-    assert trainer.state.shine.float().mean() > 20
+    assert trainer.state.maps["shine"].float().mean() > 20
     resumed_everywhere(scene, recipe, "cpu", every=4)
 
 
@@ -116,5 +104,4 @@ def test_frozen_splats_show_the_surface_too() -> None:
     frozen = Splats(**{**dict(flat_wall().items()), "shN": torch.zeros(len(flat_wall()), 3, 3)})
     trainer = Trainer(scene, robust(), GENERIC, backend="cpu", init=few, options=TrainerOptions(frozen=frozen))
     trainer.run()
-    assert trainer.state.shine is not None
-    assert trainer.state.shine.float().mean() > 20
+    assert trainer.state.maps["shine"].float().mean() > 20

@@ -32,6 +32,18 @@ def is_number(text: str) -> bool:
     return re.fullmatch("[0-9]{1,18}", text) is not None
 
 
+def enlarged(cells: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return a map [S, T] of cells as an image [height, width]."""
+    rows, columns = (np.arange(side) * count // side for side, count in zip((height, width), cells.shape, strict=True))
+    return np.asarray(cells[rows[:, None], columns])
+
+
+def at_cells(image: np.ndarray, cells: int) -> np.ndarray:
+    """Return the pixels [cells, cells] of an image [H, W] at the centres of the cells."""
+    rows, columns = (np.floor((np.arange(cells) + 0.5) / cells * side).astype(int) for side in image.shape)
+    return np.asarray(image[rows[:, None], columns])
+
+
 def to_uint8(image: np.ndarray) -> np.ndarray:
     """Convert float in [0, 1] (clipped) or bool to uint8; uint8 is returned unchanged."""
     image = np.asarray(image)

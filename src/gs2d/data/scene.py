@@ -13,7 +13,7 @@ import numpy as np
 
 from gs2d.core.camera import Camera, Zoom
 from gs2d.core.checks import check_shapes
-from gs2d.core.image_arrays import composite
+from gs2d.core.image_arrays import composite, enlarged
 from gs2d.core.memory import trim
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
@@ -40,6 +40,7 @@ class View:
     zoom: Zoom | None = None  # learned change of the intrinsics of ``camera``; None: unchanged
     # Learned parameters of how the image shows the colours of the scene (``gs2d.training.learned``).
     appearance: Appearance = field(default_factory=dict)
+    transient: np.ndarray | None = None  # [S, S] bool: cells that show what no other image shows; not in ``mask()``
     is_face: bool = False  # whether it was cut out of a panorama or a wide fisheye (``data/faces.py``)
 
     @classmethod
@@ -62,6 +63,10 @@ class View:
         """Return the view with another pose, and other intrinsics; its image stays in the cache of this view."""
         camera = replace(self.camera, T_cam_world=T_cam_world)
         return self._sharing(camera=camera) if zoom is None else self._sharing(camera=camera.zoomed(zoom), zoom=zoom)
+
+    def without(self, transient: np.ndarray) -> View:
+        """Return the view whose mask leaves out the cells of ``transient``, bool [S, S]."""
+        return self._sharing(transient=transient) if transient.any() else self
 
     def with_appearance(self, appearance: Appearance) -> View:
         """Return the view with further appearance parameters."""
@@ -86,7 +91,10 @@ class View:
     def mask(self) -> np.ndarray | None:
         """Return the mask of used pixels, bool [H, W] (a copy); None: all are used."""
         mask = self._image().mask
-        return None if mask is None else mask.copy()
+        if self.transient is None:
+            return None if mask is None else mask.copy()
+        kept: np.ndarray = ~enlarged(self.transient, self.camera.height, self.camera.width)
+        return kept if mask is None else kept & mask
 
     def valid(self) -> np.ndarray | None:
         """Return the mask of valid pixels, bool [H, W] (a copy); None: all are valid.

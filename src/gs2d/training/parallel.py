@@ -265,13 +265,11 @@ def _tensors(state: TrainState) -> Iterator[Tensor]:
         if name in state.moments:
             yield state.moments[name].mean
             yield state.moments[name].square
-    for named in (state.groups, state.statistics or {}):
+    for named in (state.groups, state.statistics or {}, state.maps):
         yield from (named[name] for name in sorted(named))
     for rows in state.learned.values():
         yield rows.values
         yield rows.square
-    if state.shine is not None:
-        yield state.shine
 
 
 def _checksum(tensor: Tensor) -> int:

@@ -24,11 +24,12 @@ def check_resumable(state: TrainState, recipe: Recipe, scene: Scene) -> None:
         raise RunError(
             f"the checkpoint refers to training view {last}, but the scene has {views}; is it from another scene?"
         )
-    if state.shine is not None and len(state.shine) != views:
-        raise RunError(
-            f"the checkpoint knows the shine of {len(state.shine)} training views, but the scene has {views}; is it of "
-            "another scene?"
-        )
+    for name, cells in state.maps.items():
+        if len(cells) != views:
+            raise RunError(
+                f"the checkpoint has maps of {name} for {len(cells)} training views, but the scene has {views}; is it "
+                "of another scene?"
+            )
     LearnedTable(recipe, scene).check(state.learned)
     _check_stage(state, recipe)
 

@@ -14,7 +14,7 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError, ShapeError
 
-FORMAT = 2  # of the state dict
+FORMAT = 3  # of the state dict
 # Errors that reading a damaged state dict raises.
 _BROKEN = (LookupError, TypeError, AttributeError, RuntimeError, ValueError)
 
@@ -104,14 +104,14 @@ class TrainState:
     learned: dict[str, LearnedRows] = field(default_factory=dict)  # quantities of images and cameras, by name
     # (stage, step, count): number of processes from a stage and step on; empty for one process throughout.
     processes: list[tuple[int, int, int]] = field(default_factory=list)
-    # [V, S, S] uint8: how shiny the surface is in cells of the training views (``training.robust.shine``).
-    shine: Tensor | None = None
+    # [V, S, S] uint8, of cells of the training views: "shine" and "transient" (modules of ``training.robust``)
+    maps: dict[str, Tensor] = field(default_factory=dict)
 
     def bare(self, index: int, flatness: Tensor | None) -> Tensor | None:
         """Return where training view ``index`` has no texture to trust, [H, W] uint8: flat or shiny pixels."""
-        if flatness is None or self.shine is None:
+        if flatness is None or "shine" not in self.maps:
             return flatness
-        shine = F.interpolate(self.shine[index][None, None].float(), flatness.shape, mode="bilinear")
+        shine = F.interpolate(self.maps["shine"][index][None, None].float(), flatness.shape, mode="bilinear")
         return torch.maximum(flatness, shine[0, 0].to(torch.uint8))
 
     def trained_by(self, count: int) -> None:
@@ -172,8 +172,7 @@ class TrainState:
         self.groups = {name: mask.to(device) for name, mask in self.groups.items()}
         if self.statistics is not None:
             self.statistics = {k: v.to(device) for k, v in self.statistics.items()}
-        if self.shine is not None:
-            self.shine = self.shine.to(device)
+        self.maps = {name: cells.to(device) for name, cells in self.maps.items()}
 
     def check(self) -> None:
         """Check that all tensors have the same N and the expected types, and that counts are valid.
@@ -195,9 +194,10 @@ class TrainState:
         statistics = {f"statistics {name}": tensor for name, tensor in (self.statistics or {}).items()}
         for name, tensor in statistics.items():
             arrays[name] = (tensor, " ".join(["N", *["_"] * (tensor.dim() - 1)]))
-        check_shapes(arrays if self.shine is None else {**arrays, "shine": (self.shine, "V S S")})
-        if self.shine is not None and self.shine.dtype != torch.uint8:
-            raise ShapeError(f"shine must be torch.uint8, got {self.shine.dtype}")
+        check_shapes({**arrays, **{f"map of {name}": (cells, f"V {name} {name}") for name, cells in self.maps.items()}})
+        for name, cells in self.maps.items():
+            if cells.dtype != torch.uint8:
+                raise ShapeError(f"the map of {name} must be torch.uint8, got {cells.dtype}")
         dtype = self.splats.dtype
         for name, tensor in [*parameters.items(), *((name, array) for name, (array, _) in arrays.items())]:
             expected = torch.bool if name in groups else tensor.dtype if name in statistics else dtype

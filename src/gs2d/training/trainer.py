@@ -44,10 +44,11 @@ from gs2d.training.parallel import ONE_PROCESS, ProcessGroup, Turn
 from gs2d.training.resumable import check_resumable
 from gs2d.training.robust.regularise import is_opaque
 from gs2d.training.robust.robustness import Robustness, with_adjusted_cameras
+from gs2d.training.robust.transients import without_transients
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
-from gs2d.training.targets import is_async, make_targets
+from gs2d.training.targets import TargetSource, is_async, make_targets
 from gs2d.training.whole_steps import WholeSteps
 
 __all__ = ["OnEvent", "Trainer", "TrainerOptions", "raster_settings"]
@@ -177,10 +178,9 @@ class Trainer:
         self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
         needs = {need for _, loss in self._losses for need in loss.needs}
         self._needs_flatness = "flatness" in needs
-        needs |= {"silhouette"} if is_opaque(self.recipe) or self.learned.changes_color else set()
-        targets = make_targets(scene, protocol, self.backend, self.state.splats, needs)
+        self._needs = needs | ({"silhouette"} if is_opaque(self.recipe) or self.learned.changes_color else set())
         self._whole = FullRender(
-            scene, self.recipe, protocol, self._learner, targets, frozen=self._frozen, learned=self.learned
+            scene, self.recipe, protocol, self._learner, self._targets(), frozen=self._frozen, learned=self.learned
         )
 
     @property
@@ -199,8 +199,12 @@ class Trainer:
         return raster_settings(self.protocol, self.scene.extent, self.recipe.sh_degree, self.recipe.mip_px)
 
     def scene_now(self) -> Scene:
-        """Return the scene with the learned quantities of its images and cameras."""
-        return self.learned.scene_now(self.state.learned)
+        """Return the scene with the learned quantities of its images and cameras, without what single images show."""
+        return without_transients(self.learned.scene_now(self.state.learned), self.state)
+
+    def _targets(self) -> TargetSource:
+        scene = without_transients(self.scene, self.state)
+        return make_targets(scene, self.protocol, self.backend, self.state.splats, self._needs)
 
     @property
     def done(self) -> bool:
@@ -275,8 +279,8 @@ class Trainer:
         )
         for number in iterations:
             happened += self._robust.remove(self.state, stage, number)
-            if self._needs_flatness:
-                self._robust.find_shine(self.state, stage, number)
+            if self._robust.compare(self.state, stage, number, shiny=self._needs_flatness):
+                self._whole.targets = self._targets()
         state.step = iteration
         if changes:
             together.check(state)

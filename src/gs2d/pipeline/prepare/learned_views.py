@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from gs2d.core.camera import Camera, Zoom
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.transforms import focus_point
 from gs2d.data import Scene, View
+from gs2d.data.image_files import read_mask, write_image
 from gs2d.errors import DataError, RunError, ShapeError
-from gs2d.io.run_dir import LEARNED, POSES, SPLATS, RunFolder
+from gs2d.io.run_dir import LEARNED, POSES, SPLATS, TRANSIENTS, RunFolder
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.learned_table import numbers_of, shown, unshown
 from gs2d.training.learned.quantity import ImagePoints
@@ -105,6 +108,40 @@ def over(view: View, color: Tensor, background: tuple[float, float, float]) -> t
     if alpha is None:
         return ()
     return torch.from_numpy(alpha).to(color), torch.tensor(background, dtype=color.dtype, device=color.device)
+
+
+# -- what single photographs show --------------------------------------------------------------------------------------
+def write_transients(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
+    """Write a mask of each photograph with pixels that no other shows, as COLMAP names masks, and report them."""
+    folder = run.file(TRANSIENTS)
+    shutil.rmtree(folder, ignore_errors=True)
+    shares = {view.name: view.transient for view in scene.train if view.transient is not None}
+    if not shares:
+        return
+    for name, cells in shares.items():
+        path = folder / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, ~cells)
+    share = sum(float(cells.mean()) for cells in shares.values()) / len(scene.train)
+    on_event(
+        Notice(
+            f"{100 * share:.1f} % of the pixels show what only one photograph shows, such as passers-by, in "
+            f"{len(shares)} of {len(scene.train)} photographs; they do not count: {TRANSIENTS}/ "
+            "(--robust off trains on all pixels)"
+        )
+    )
+
+
+def with_transients(run: RunFolder, scene: Scene) -> Scene:
+    """Return a scene whose masks leave out the pixels that training left out.
+
+    Raises DataError if a mask is damaged.
+    """
+    if not (folder := run.file(TRANSIENTS)).is_dir():
+        return scene
+    paths = ((view, folder / f"{view.name}.png") for view in scene.train)
+    train = (view.without(~read_mask(path)) if path.exists() else view for view, path in paths)
+    return replace(scene, train=tuple(train))
 
 
 # -- cameras -----------------------------------------------------------------------------------------------------------

@@ -14,23 +14,26 @@ from torch import Tensor
 from gs2d.config.protocols import BLACK
 from gs2d.config.recipe import DenseStart, Recipe, Removal, Stage
 from gs2d.core.camera import Camera
+from gs2d.core.image_arrays import enlarged
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.kernels.library import optional_library
 from gs2d.meshing.warped_ncc import GreyImage
+from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.learned.learned_table import LearnedTable, shown
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.parallel import ONE_PROCESS, ProcessGroup
-from gs2d.training.robust import shine
+from gs2d.training.robust import shine, transients
 from gs2d.training.robust.backdrop import in_color
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
 from gs2d.training.robust.large_splats import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.regularise import is_opaque
 from gs2d.training.robust.trial import Witness, missed
+from gs2d.training.robust.view_cells import ViewCells
 from gs2d.training.rows import keep_rows
 from gs2d.training.start.background_sphere import sphere_points
 from gs2d.training.start.camera_adjustment import adjust_cameras
@@ -167,7 +170,7 @@ class Robustness:
 
     def acts(self, stage: Stage, iteration: int) -> bool:
         """Return whether the state may change at the end of an iteration (1-based) of a stage, besides decay."""
-        return self.removes(stage, iteration) or self._looks_for_shine(stage, iteration)
+        return self.removes(stage, iteration) or self._compares(stage, iteration)
 
     def removes(self, stage: Stage, iteration: int) -> bool:
         """Return whether splats may be removed at the end of an iteration (1-based) of a stage."""
@@ -209,29 +212,59 @@ class Robustness:
         limits = torch.where(shrinks[:, None], most, most + math.log(LARGEST_ANYWHERE / LARGEST))
         self._backend.assign(scales, torch.minimum(scales, limits))
 
-    def find_shine(self, state: TrainState, stage: Stage, iteration: int) -> None:
-        """Detect shiny surfaces in the images, if due; without the native library all count as matt."""
-        if not self._looks_for_shine(stage, iteration):
-            return
-        matt = torch.zeros((len(self.scene.train), shine.CELLS, shine.CELLS), dtype=torch.uint8)
-        state.shine = self._processes.decide(partial(self._shine, state, matt), matt.to(state.splats.device))
+    def compare(self, state: TrainState, stage: Stage, iteration: int, *, shiny: bool) -> bool:
+        """Compare the images with one another, if due, and return whether that was done.
 
-    def _looks_for_shine(self, stage: Stage, iteration: int) -> bool:
+        Detects what single images show and, with ``shiny``, shiny surface; without the native library all is matt.
+        """
+        if not self._compares(stage, iteration):
+            return False
+
+        def decided(cells: int, find: Callable[[TrainState, Tensor], Tensor]) -> Tensor:
+            nothing = torch.zeros((len(self.scene.train), cells, cells), dtype=torch.uint8)
+            on_device = nothing.to(state.splats.device)
+            return self._processes.decide(lambda: find(state, nothing).to(on_device.device), on_device)
+
+        if len(self.scene.train) > transients.SHOWING:
+            state.maps["transient"] = decided(transients.CELLS, self._transients)
+        if shiny:
+            state.maps["shine"] = decided(shine.CELLS, self._shine)
+        return True
+
+    def _compares(self, stage: Stage, iteration: int) -> bool:
         return self._recipe.removal is not None and shine.is_due(stage, iteration)
+
+    @torch.no_grad()
+    def _transients(self, state: TrainState, nothing: Tensor) -> Tensor:
+        splats, settings = self._whole(state.splats), self._raster.for_depths("transmittance")
+
+        def rendered(row: int) -> ViewCells:
+            image, camera = self._images[row], self._camera(state, row)
+            output = rasterize(splats, camera, settings, backend=self._backend)
+            numbers = self._learned.numbers(state.learned, row, output.color)
+            color = shown(output.color, numbers, ImagePoints(camera))
+            depth = torch.where(output.alpha > 0.5, output.depth("transmittance"), 0.0)
+            photograph = image.color.permute(1, 2, 0).to(color)
+            return transients.differences(camera, photograph, color, depth, image.usable)
+
+        return transients.transient_maps(map(rendered, range(len(nothing))))
 
     def _shine(self, state: TrainState, matt: Tensor) -> Tensor:
         library = optional_library()
         if library is None:
-            return matt.to(state.splats.device)
+            return matt
 
         def image_at(row: int) -> GreyImage:
-            image = self._images[row]
-            return GreyImage(self._camera(state, row), image.grey[0, 0].numpy(), image.usable)
+            return GreyImage(self._camera(state, row), self._images[row].grey[0, 0].numpy(), self._usable(state, row))
 
-        maps = shine.shine_maps(
+        return shine.shine_maps(
             self._whole(state.splats), image_at, self._neighbours, self._raster, self._backend, library
         )
-        return maps.to(state.splats.device)
+
+    def _usable(self, state: TrainState, row: int) -> np.ndarray:
+        """Return the pixels of a downscaled image that count, bool [H, W]."""
+        usable, maps = self._images[row].usable, state.maps.get("transient")
+        return usable if maps is None else usable & (enlarged(maps[row].cpu().numpy(), *usable.shape) == 0)
 
     def _are_shown(self, splats: Splats, large: Tensor) -> Tensor:
         """Return which of the large splats lie on a surface that many images show, uint8 [N]."""
@@ -294,7 +327,7 @@ class Robustness:
             color = image.color.permute(1, 2, 0).to(device)
             numbers = self._learned.numbers(state.learned, row, color)
             photographed = partial(shown, numbers=numbers, at=ImagePoints(camera))
-            yield Witness(camera, color, torch.from_numpy(image.usable).to(device), photographed)
+            yield Witness(camera, color, torch.from_numpy(self._usable(state, row)).to(device), photographed)
 
     def _camera(self, state: TrainState, row: int) -> Camera:
         """Return the current camera of a downscaled image."""

@@ -24,15 +24,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gs2d.config.recipe import Stage
-from gs2d.core.camera import Camera
+from gs2d.core.image_arrays import at_cells
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
-from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.refine import MATT, OFTEN, RARELY, SHINY
 from gs2d.meshing.warped_ncc import DrawnMesh, GreyImage, MatchSettings, brightness_share
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
+from gs2d.training.robust.view_cells import ViewCells, lower_median_elsewhere
 
 WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are recomputed: the surface must be there
 CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny surfaces have matt-looking spots
@@ -86,8 +86,9 @@ def shine_maps(
         results = pool.map(partial(_shine, library=library), map(views.__getitem__, compared), beside)
         for index, shine in zip(compared, results, strict=True):
             maps[index] = shine
+    cells = {row: ViewCells(view.image.camera, maps[row], at_cells(view.depth, CELLS)) for row, view in views.items()}
     for index, others in compared.items():
-        there = _shown_by(views[index], [(views[other].image.camera, maps[other]) for other in others])
+        there, _ = lower_median_elsewhere(cells[index], [cells[other] for other in others])
         confirmed[index] = np.minimum(maps[index], there)
     return torch.from_numpy(np.rint(255 * confirmed).astype(np.uint8))
 
@@ -103,21 +104,3 @@ def _shine(view: _RenderedView, beside: Sequence[_RenderedView], library: Librar
     shiny = np.clip((bright / np.maximum(textured, TINY) - MATT) / (SHINY - MATT), 0, 1)
     shiny *= np.clip((often / np.maximum(drawn, TINY) - RARELY) / (OFTEN - RARELY), 0, 1)
     return np.where(textured > LEAST, shiny, 0.0)
-
-
-def _shown_by(view: _RenderedView, maps: Sequence[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """Return the lower median of other maps at the surface that the cells of a photograph show."""
-    camera, centres = view.image.camera, (np.arange(CELLS) + 0.5) / CELLS
-    rows, columns = (np.floor(centres * side).astype(int) for side in view.depth.shape)
-    rows, columns = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
-    depth = view.depth[rows, columns].astype(np.float64)
-    places, shown = backproject(camera, depth, rows, columns), np.full((len(maps), len(depth)), np.nan)
-    for number, (other, there) in enumerate(maps):
-        pixels, z = other.project(places)
-        cells = np.floor(pixels / (other.width, other.height) * CELLS)
-        inside = (depth > 0) & (z > 0) & (cells >= 0).all(axis=1) & (cells < CELLS).all(axis=1)
-        column, row = cells[inside].astype(int).T
-        shown[number, inside] = there[row, column]
-    shown.sort(axis=0)  # NaN last
-    middle = np.maximum(np.isfinite(shown).sum(axis=0) - 1, 0) // 2
-    return np.nan_to_num(shown[middle, np.arange(len(depth))]).reshape(CELLS, CELLS)
