@@ -17,7 +17,7 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.library import ready_library
 from gs2d.meshing.warped_ncc import GreyImage
-from gs2d.render.backends import get_backend
+from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.robust.shine import CELLS, shine_maps
 from gs2d.training.state import TrainState
@@ -51,9 +51,13 @@ def maps_of(scene: Scene, neighbours: Sequence[Sequence[int]]) -> torch.Tensor:
         library = ready_library()
     except BackendError:
         pytest.skip("the native library is not built")
-    images = [GreyImage(view.camera, view.target((0.0, 0.0, 0.0)).mean(axis=2)) for view in scene.train]
-    backend = get_backend("reference")
-    return shine_maps(flat_wall(), images.__getitem__, neighbours, RasterSettings(), backend, library)
+
+    def rendered(row: int) -> tuple[GreyImage, np.ndarray]:
+        view = scene.train[row]
+        output = rasterize(flat_wall(), view.camera, RasterSettings().for_depths("transmittance"), backend="reference")
+        return GreyImage(view.camera, view.target((0.0, 0.0, 0.0)).mean(axis=2)), output.depth("transmittance").numpy()
+
+    return shine_maps(rendered, neighbours, library)
 
 
 BESIDE = ((1, 2), (0, 2), (1, 3), (2, 4), (3, 2))

@@ -68,6 +68,11 @@ def test_a_surface_that_too_few_views_show_stays() -> None:
     assert not transient_maps([replace(views[0], values=passer), *hidden])[0].any()
 
 
+def test_a_photograph_in_another_light_stays_whole() -> None:
+    assert compared(2, at=(slice(0, CELLS), slice(0, 40)))[2].any()
+    assert not compared(2, at=(slice(0, CELLS), slice(0, 60))).any()
+
+
 def with_passer(scene: Scene) -> Scene:
     """Put a white block before the wall in the third photograph."""
     views = list(scene.train)
@@ -137,6 +142,10 @@ def test_the_mask_of_a_view_and_its_cells_are_joined() -> None:
     assert not mask[0].any()
     assert not mask[:, : WIDTH // 2].any()
     assert mask[1:, WIDTH // 2 :].all()
+    kept = view.without(cells).usable(masks=False)  # protocols that ignore the user's masks leave them out, too
+    assert kept is not None
+    assert kept[:, WIDTH // 2 :].all()
+    assert not kept[:, : WIDTH // 2].any()
 
 
 def test_maps_of_another_scene_are_refused() -> None:

@@ -40,7 +40,7 @@ class View:
     zoom: Zoom | None = None  # learned change of the intrinsics of ``camera``; None: unchanged
     # Learned parameters of how the image shows the colours of the scene (``gs2d.training.learned``).
     appearance: Appearance = field(default_factory=dict)
-    transient: np.ndarray | None = None  # [S, S] bool: cells that show what no other image shows; not in ``mask()``
+    transient: np.ndarray | None = None  # [S, S] bool: cells that show what no other image shows, and do not count
     is_face: bool = False  # whether it was cut out of a panorama or a wide fisheye (``data/faces.py``)
 
     @classmethod
@@ -90,7 +90,9 @@ class View:
 
     def mask(self) -> np.ndarray | None:
         """Return the mask of used pixels, bool [H, W] (a copy); None: all are used."""
-        mask = self._image().mask
+        return self._without_transient(self._image().mask)
+
+    def _without_transient(self, mask: np.ndarray | None) -> np.ndarray | None:
         if self.transient is None:
             return None if mask is None else mask.copy()
         kept: np.ndarray = ~enlarged(self.transient, self.camera.height, self.camera.width)
@@ -108,9 +110,10 @@ class View:
     def usable(self, *, masks: bool) -> np.ndarray | None:
         """Return the pixels that training and scores use, bool [H, W]; None: all.
 
-        If the protocol uses masks: ``mask()``, which excludes invalid pixels too; else ``valid()``.
+        If the protocol uses masks: ``mask()``, which excludes invalid pixels too; else ``valid()`` without transients.
         """
-        return self.mask() if masks else self.valid()
+        image = self._image()
+        return self._without_transient(image.mask if masks else image.valid)
 
     def object_mask(self) -> np.ndarray | None:
         """Return the silhouette of the object, bool [H, W] (a copy): from a file, else alpha >= 0.5, else None.

@@ -172,7 +172,8 @@ def rasterize_2dgs(
         for name, tensor in tensors._asdict().items():
             if tensor is not None or name not in ("backgrounds", "screen_probe"):
                 check_dense(name, tensor)
-    if torch.compiler.is_compiling() or not _is_plain(splats.means):
+    captured = type(splats.means) not in (Tensor, torch.nn.Parameter)  # a subclass that captures graphs
+    if torch.compiler.is_compiling() or captured:
         if not isinstance(backend, str):
             raise BackendError(f"a captured graph needs the name of a backend: use backend={backend.name!r}")
         constants = [float(getattr(settings, name)) for name in CONSTANTS]
@@ -219,11 +220,6 @@ class _Numbers(NamedTuple):
         """Render the tensors."""
         degree = None if self.sh_degree == PLAIN_COLORS else self.sh_degree
         return _render(tensors, (self.width, self.height), degree, self.settings, self.backend)
-
-
-def _is_plain(tensor: object) -> bool:
-    """Whether it is an ordinary tensor, not a subclass that captures graphs."""
-    return type(tensor) in (Tensor, torch.nn.Parameter)
 
 
 def _render(

@@ -50,6 +50,7 @@ FEW_NEW = 0.002  # fraction of the splats: fewer new proposals wait, because a t
 SHOWN = 0.25  # fraction of the images, and at least 3, that must show a surface on which splats are kept small
 LIMITED_FROM = 0.4  # of a stage: before, training goes from coarse to fine, and shrinking costs up to 1.2 dB
 MAX_WITNESSES = 24  # images of a trial; with more images, each trial uses others
+COMPARED = (0.3, 0.5, 0.7)  # fractions of a stage after which images are compared: the surface must be there
 DECAY_EVERY, LEAST_OPACITY = 10, 0.005  # iterations between decays; opacity that decay does not go below
 NEEDED, REMOVED = 1, 2  # verdicts; 0: not tried
 MISSED = "missed"  # row group of the splats that a trial found to be needed
@@ -213,12 +214,13 @@ class Robustness:
         self._backend.assign(scales, torch.minimum(scales, limits))
 
     def compare(self, state: TrainState, stage: Stage, iteration: int, *, shiny: bool) -> bool:
-        """Compare the images with one another, if due, and return whether that was done.
+        """Compare the images with one another, if due, and return whether other pixels count from now on.
 
         Detects what single images show and, with ``shiny``, shiny surface; without the native library all is matt.
         """
         if not self._compares(stage, iteration):
             return False
+        before = state.maps.get("transient")
 
         def decided(cells: int, find: Callable[[TrainState, Tensor], Tensor]) -> Tensor:
             nothing = torch.zeros((len(self.scene.train), cells, cells), dtype=torch.uint8)
@@ -229,37 +231,40 @@ class Robustness:
             state.maps["transient"] = decided(transients.CELLS, self._transients)
         if shiny:
             state.maps["shine"] = decided(shine.CELLS, self._shine)
-        return True
+        now = state.maps.get("transient")
+        return now is not None and bool(now.any() if before is None else (now != before).any())
 
     def _compares(self, stage: Stage, iteration: int) -> bool:
-        return self._recipe.removal is not None and shine.is_due(stage, iteration)
+        due = {round(part * stage.iterations) for part in COMPARED}
+        return self._recipe.removal is not None and stage.moves_all and iteration in due
 
     @torch.no_grad()
+    def _rendered(self, state: TrainState, row: int) -> tuple[Camera, Tensor, np.ndarray]:
+        """Return camera, colours as photographed [H, W, 3] and depth [H, W] (0: no surface) of a downscaled image."""
+        camera, settings = self._camera(state, row), self._raster.for_depths("transmittance")
+        output = rasterize(self._whole(state.splats), camera, settings, backend=self._backend)
+        numbers = self._learned.numbers(state.learned, row, output.color)
+        depth = torch.where(output.alpha > 0.5, output.depth("transmittance"), 0.0)
+        return camera, shown(output.color, numbers, ImagePoints(camera)), depth.cpu().numpy()
+
     def _transients(self, state: TrainState, nothing: Tensor) -> Tensor:
-        splats, settings = self._whole(state.splats), self._raster.for_depths("transmittance")
+        def compared(row: int) -> ViewCells:
+            image, (camera, color, depth) = self._images[row], self._rendered(state, row)
+            difference = image.color.permute(1, 2, 0) - color.cpu()
+            return transients.differences(camera, difference, depth, image.usable)
 
-        def rendered(row: int) -> ViewCells:
-            image, camera = self._images[row], self._camera(state, row)
-            output = rasterize(splats, camera, settings, backend=self._backend)
-            numbers = self._learned.numbers(state.learned, row, output.color)
-            color = shown(output.color, numbers, ImagePoints(camera))
-            depth = torch.where(output.alpha > 0.5, output.depth("transmittance"), 0.0)
-            photograph = image.color.permute(1, 2, 0).to(color)
-            return transients.differences(camera, photograph, color, depth, image.usable)
-
-        return transients.transient_maps(map(rendered, range(len(nothing))))
+        return transients.transient_maps(map(compared, range(len(nothing))))
 
     def _shine(self, state: TrainState, matt: Tensor) -> Tensor:
         library = optional_library()
         if library is None:
             return matt
 
-        def image_at(row: int) -> GreyImage:
-            return GreyImage(self._camera(state, row), self._images[row].grey[0, 0].numpy(), self._usable(state, row))
+        def rendered(row: int) -> tuple[GreyImage, np.ndarray]:
+            camera, _, depth = self._rendered(state, row)
+            return GreyImage(camera, self._images[row].grey[0, 0].numpy(), self._usable(state, row)), depth
 
-        return shine.shine_maps(
-            self._whole(state.splats), image_at, self._neighbours, self._raster, self._backend, library
-        )
+        return shine.shine_maps(rendered, self._neighbours, library)
 
     def _usable(self, state: TrainState, row: int) -> np.ndarray:
         """Return the pixels of a downscaled image that count, bool [H, W]."""

@@ -23,27 +23,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.config.recipe import Stage
 from gs2d.core.image_arrays import at_cells
-from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
 from gs2d.meshing.refine import MATT, OFTEN, RARELY, SHINY
 from gs2d.meshing.warped_ncc import DrawnMesh, GreyImage, MatchSettings, brightness_share
-from gs2d.render.api import rasterize
-from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings
 from gs2d.training.robust.view_cells import ViewCells, lower_median_elsewhere
 
-WHEN = (0.3, 0.5, 0.7)  # fractions of a stage after which the maps are recomputed: the surface must be there
 CELLS, REACH = 48, 7  # cells a side of a map, and of the windows of means: shiny surfaces have matt-looking spots
 TINY = 1e-12
 WORKERS = 4  # threads; those of the library come on top
 LEAST = 0.05  # mean weight below which a cell is matt: no texture, which flatness handles
-
-
-def is_due(stage: Stage, iteration: int) -> bool:
-    """Return whether the maps are computed at the end of an iteration (1-based) of a stage."""
-    return stage.moves_all and iteration in {round(part * stage.iterations) for part in WHEN}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,26 +43,17 @@ class _RenderedView:
     depth: np.ndarray
 
 
-@torch.no_grad()
 def shine_maps(
-    splats: Splats,
-    image_at: Callable[[int], GreyImage],
-    neighbours: Sequence[Sequence[int]],
-    settings: RasterSettings,
-    backend: Backend,
-    library: Library,
+    rendered: Callable[[int], tuple[GreyImage, np.ndarray]], neighbours: Sequence[Sequence[int]], library: Library
 ) -> Tensor:
     """Return how shiny the surface is in each photograph: [V, CELLS, CELLS] uint8, from 0, matt, to 255.
 
-    ``image_at`` returns a downscaled photograph. ``neighbours`` are the photographs that each one is compared with;
-    without any, all of it counts as matt.
+    ``rendered`` returns a downscaled photograph and its rendered depth [H, W] in world units, 0 without a surface.
+    ``neighbours`` are the photographs that each one is compared with; without any, all of it counts as matt.
     """
-    settings = settings.for_depths("transmittance")
 
     def drawn(index: int) -> _RenderedView:
-        image = image_at(index)
-        output = rasterize(splats, image.camera, settings, backend=backend)
-        depth = torch.where(output.alpha > 0.5, output.depth("transmittance"), 0.0).cpu().numpy()
+        image, depth = rendered(index)
         inner = DrawnMesh(np.zeros(0, np.int32), depth).inner(image.camera.fx)
         return _RenderedView(replace(image, usable=inner if image.usable is None else inner & image.usable), depth)
 

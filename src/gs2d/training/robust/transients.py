@@ -36,14 +36,15 @@ LEAST = 0.06  # of colours in [0, 1]; exposure that is not learned and highlight
 TYPICAL, TIMES = 6.0, 3.0
 SEEN, SHOWING = 12, 3
 SIDE = 3  # thin parts that are not built yet are narrower
+MOST = 0.5  # of a photograph; if more differs, its light or camera does, and it stays whole
 
 
-def differences(camera: Camera, photograph: Tensor, rendered: Tensor, depth: Tensor, usable: np.ndarray) -> ViewCells:
-    """Return how much a photograph and its rendering [H, W, 3] differ in each cell; 0 where it is not ``usable``."""
-    difference = (photograph - rendered).cpu() * torch.from_numpy(usable)[..., None]
-    cells = F.adaptive_avg_pool2d(difference.permute(2, 0, 1)[:, None].float(), CELLS)
+def differences(camera: Camera, difference: Tensor, depth: np.ndarray, usable: np.ndarray) -> ViewCells:
+    """Return d of each cell from photograph minus rendering [H, W, 3]; 0 where the photograph is not ``usable``."""
+    counted = (difference * torch.from_numpy(usable)[..., None]).permute(2, 0, 1)
+    cells = F.adaptive_avg_pool2d(counted[:, None].float(), CELLS)
     means = F.avg_pool2d(cells, 3, 1, 1, count_include_pad=False)[:, 0].abs().amax(dim=0)
-    return ViewCells(camera, means.numpy(), at_cells(depth.cpu().numpy(), CELLS))
+    return ViewCells(camera, means.numpy(), at_cells(depth, CELLS))
 
 
 def transient_maps(views: Iterable[ViewCells]) -> Tensor:
@@ -59,7 +60,8 @@ def transient_maps(views: Iterable[ViewCells]) -> Tensor:
 def _transient(view: ViewCells, others: Sequence[ViewCells], least: float) -> np.ndarray:
     elsewhere, count = lower_median_elsewhere(view, others)
     differs = (count >= SHOWING) & (view.values > least + TIMES * elsewhere)
-    return binary_dilation(binary_opening(differs, np.ones((SIDE, SIDE), bool)), np.ones((3, 3), bool))
+    found: np.ndarray = binary_dilation(binary_opening(differs, np.ones((SIDE, SIDE), bool)), np.ones((3, 3), bool))
+    return found & (found.mean() <= MOST)
 
 
 def without_transients(scene: Scene, state: TrainState) -> Scene:

@@ -129,13 +129,9 @@ class Sweep:
     depths: Sequence[np.ndarray]
     scores: Sequence[np.ndarray]
 
-    def quorum(self, index: int) -> int:
-        """Return how many neighbours of a view must agree on a depth."""
-        return min(VOTES, max(1, len(self.neighbours[index]) - 1))
-
     def consistent(self, index: int) -> np.ndarray:
         """Return the pixels on whose depth enough neighbours agree, bool [H, W]."""
-        return self.agreeing(index, AGREE) >= self.quorum(index)
+        return self.agreeing(index, AGREE) >= min(VOTES, max(1, len(self.neighbours[index]) - 1))
 
     def agreeing(self, index: int, fraction: float) -> np.ndarray:
         """Return the number of neighbours that have the same depth for the point of each pixel, int [H, W]."""
