@@ -101,7 +101,7 @@ def loop_counts() -> Counts:
         options = ["-DCMAKE_BUILD_TYPE=Release", "-DCMAKE_EXPORT_COMPILE_COMMANDS=ON"]
         _run([cmake, "-S", str(ROOT), "-B", folder, *options])
         for entry in json.loads(Path(folder, "compile_commands.json").read_text()):
-            if "gs2d_cpu_v4.dir" in entry["command"] and entry["file"].endswith(("forward.cpp", "backward.cpp")):
+            if "gs2d_cpu_v4.dir" in entry["command"] and entry["file"].endswith(("/forward.cpp", "/backward.cpp")):
                 words, target = shlex.split(entry["command"]), f"{folder}/blend.o"
                 words[words.index("-o") + 1] = target
                 _run(words, cwd=folder)

@@ -85,7 +85,7 @@ INSIDE = {
         "cpu_passes cuda_step reference_contributors": 3,
         "cuda_passes reference_pairs": 2,
         "pair_budget whole_step cuda_works reference_projection": 1,
-        "types": 0,
+        "rays types": 0,
     },
     "training": {
         "trainer": 6,

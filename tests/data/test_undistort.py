@@ -12,6 +12,7 @@ from PIL import Image
 from capture_writers import small_colmap
 from gs2d.data import load_scene
 from gs2d.data.camera_models import Lens
+from gs2d.data.faces import panorama
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics, source_positions, undistort_image
 
 WIDTH, HEIGHT, F, CX, CY = 160, 120, 110.0, 77.0, 63.5
@@ -130,6 +131,22 @@ def test_a_folding_polynomial_is_cut_at_its_maximum() -> None:
     k = Intrinsics(400, 20, 100.0, 100.0, 200.0, 10.0, lens)
     _, valid = source_positions(k)
     np.testing.assert_array_equal(np.flatnonzero(valid[10])[[0, -1]], [200 - 129, 199 + 129])
+
+
+@pytest.mark.parametrize("model", [*MODELS, "PINHOLE", "EQUIRECTANGULAR", "sheared"])
+def test_the_rays_of_all_pixels_lead_back_to_them(model: str) -> None:
+    k = Intrinsics(160, 80, 42.0, 42.0, CX, CY, Lens("fisheye", (0.02, -0.03), tangential=(0.001, -0.002), skew=0.01))
+    if model == "EQUIRECTANGULAR":
+        k = panorama(160, 80, "a panorama")
+    elif model != "sheared":  # a fisheye whose polynomial folds back before the corners
+        k = colmap_intrinsics("camera 1", model, WIDTH, HEIGHT, MODELS.get(model, (F, F, CX, CY)))
+    rays = k.rays()
+    shown = (rays != 0).any(axis=-1)
+    assert 0.5 < shown.mean() < 1 if model == "sheared" else shown.all()
+    points, visible = (k.lens or Lens("perspective")).project(rays[shown])
+    pixels = np.stack(np.meshgrid(np.arange(k.width) + 0.5, np.arange(k.height) + 0.5), axis=-1)[shown]
+    assert visible.all()
+    np.testing.assert_allclose(points * (k.fx, k.fy) + (k.cx, k.cy), pixels, atol=1e-4)
 
 
 def test_masks_are_undistorted_with_their_image(tmp_path: Path) -> None:

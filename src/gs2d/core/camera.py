@@ -43,6 +43,8 @@ class Camera:
         ``T_cam_world`` as a tensor that requires a gradient (``rasterize``, rule 20).
     intrinsics : Tensor [4] or None
         fx, fy, cx and cy as a tensor that requires a gradient, with equal values (``rasterize``, rule 21).
+    rays : Tensor [H, W, 4] or None
+        The ray of each pixel instead of a pinhole's, from ``gs2d.render.rays.ray_map`` (``rasterize``, rule 25).
     """
 
     width: int
@@ -54,6 +56,7 @@ class Camera:
     T_cam_world: np.ndarray  # [4, 4]
     pose: Tensor | None = None  # [4, 4]
     intrinsics: Tensor | None = None  # [4]
+    rays: Tensor | None = None  # [H, W, 4]
 
     def __post_init__(self) -> None:
         matrix: Any = self.T_cam_world
@@ -147,6 +150,8 @@ class Camera:
 
     def _with(self, width: int, height: int, numbers: tuple[float, ...], factors: tuple[float, ...]) -> Camera:
         """Return the camera with another size and intrinsics; an intrinsics tensor is scaled differentiably."""
+        if self.rays is not None:
+            raise ShapeError("a camera with rays has one size; make a camera with the rays of the other size")
         learning = None
         if self.intrinsics is not None:
             learning = self.intrinsics * self.intrinsics.new_tensor(factors)
@@ -166,6 +171,8 @@ class Camera:
         pixels : ndarray [P, 2] px
         depth : ndarray [P] world units, along the optical axis (points behind the camera have depth <= 0)
         """
+        if self.rays is not None:
+            raise ShapeError("a camera with rays has no pinhole projection")
         x = points @ self.rotation.T + self.T_cam_world[:3, 3]
         z = x[:, 2]
         safe = np.where(np.abs(z) < 1e-12, 1e-12, z)

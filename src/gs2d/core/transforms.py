@@ -232,3 +232,16 @@ def transform_splats(splats: Splats, scale: float, rotation: np.ndarray, transla
         sh0=a["sh0"],
         shN=shN,
     ).to(torch.float32)
+
+
+def perpendicular(units: Tensor) -> Tensor:
+    """Return two unit vectors [..., 2, 3] at right angles to each unit vector [..., 3] and to each other.
+
+    They are the axes x and y, turned with the axis z to the vector (with -z, where that is nearer).
+    """
+    x, y, z = units.unbind(dim=-1)
+    sign = torch.where(z < 0, -1.0, 1.0).to(units)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=-1)
+    return torch.stack([first, torch.stack([b, sign + y * y * a, -y], dim=-1)], dim=-2)

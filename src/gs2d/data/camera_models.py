@@ -1,6 +1,6 @@
 """Camera models: where the lens of a photograph shows the rays of its camera.
 
-The rasterizer renders pinhole images. A photograph of any other camera is resampled when it is read: into the pinhole
+Training uses pinhole images. A photograph of any other camera is resampled when it is read: into the pinhole
 image of its own focal length (:mod:`gs2d.data.undistort`), or, if it sees more than such an image holds, into the faces
 of a cube (:mod:`gs2d.data.faces`). Both need one function of the camera model: from rays to points of the sensor.
 
@@ -23,16 +23,22 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy.optimize import brentq
+from scipy.spatial import cKDTree
 
 from gs2d.config.registry import Register, Registry
+from gs2d.core.transforms import perpendicular
 from gs2d.errors import DataError
 
 PANORAMA = "equirectangular"
 _SMALLEST = 1e-12  # radius, so that nothing is divided by 0
+# Newton's method: rays it may start from, steps, the difference for slopes, the longest step (radians), and the error
+# of a result (focal lengths).
+_SPHERE, _STEPS, _SMALL, _REACH, _CLOSE = 20_000, 8, 1e-6, 0.1, 1e-7
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,11 @@ class Lens:
             points = points + self.skew * points[..., 1:] * (1.0, 0.0)
         return points, shown
 
+    def unproject(self, points: np.ndarray) -> np.ndarray:
+        """Return the unit rays [..., 3] of points [..., 2] in focal lengths; 0 where the lens shows none."""
+        points = points - self.skew * points[..., 1:] * (1.0, 0.0)
+        return model_of(self).unproject(replace(self, skew=0.0), points)
+
     def distort(self, points: np.ndarray) -> np.ndarray:
         """Return where ideal points [..., 2] of the plane z = 1 are on the sensor [..., 2], in focal lengths."""
         return self.project(np.concatenate([points, np.ones_like(points[..., :1])], axis=-1))[0]
@@ -75,6 +86,29 @@ class CameraModel:
     def project(self, lens: Lens, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the points [..., 2] of rays [..., 3], in focal lengths, and which rays the lens shows [...] bool."""
         raise NotImplementedError
+
+    def unproject(self, lens: Lens, points: np.ndarray) -> np.ndarray:
+        """Return the unit rays [..., 3] of points [..., 2] in focal lengths; 0 where the lens shows none.
+
+        This is Newton's method for ``project``, which starts from the nearest of many rays whose points are known.
+        Models whose inverse is a formula override it.
+        """
+        z = np.arange(1 - _SPHERE, _SPHERE, 2) / _SPHERE  # a spiral on the sphere, without its poles
+        turn, across = np.arange(_SPHERE) * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - z * z)
+        known = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=-1)
+        at, shown = lens.project(known)
+        rays = known[shown][cKDTree(at[shown]).query(points)[1]]
+        for _ in range(_STEPS):
+            axes = perpendicular(torch.from_numpy(rays)).numpy()  # [..., 2, 3]
+            at, moved = lens.project(rays)[0], lens.project(rays[..., None, :] + _SMALL * axes)[0]
+            slopes = np.moveaxis((moved - at[..., None, :]) / _SMALL, (-2, -1), (0, 1))  # [2 axes, 2 coordinates, ...]
+            (a, c), (b, d), (x, y) = slopes[0], slopes[1], np.moveaxis(points - at, -1, 0)
+            with np.errstate(all="ignore"):
+                steps = np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
+            rays = rays + (np.nan_to_num(steps).clip(-_REACH, _REACH)[..., None] * axes).sum(axis=-2)
+            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        at, shown = lens.project(rays)
+        return np.where((shown & (np.abs(at - points).max(axis=-1) < _CLOSE))[..., None], rays, 0.0)
 
     def is_identity(self, lens: Lens) -> bool:
         """Whether a lens with these parameters distorts nothing."""
@@ -193,6 +227,11 @@ class Equirectangular(CameraModel):
         """Return longitude and latitude."""
         x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
         return np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1), np.ones(x.shape, dtype=bool)
+
+    def unproject(self, lens: Lens, points: np.ndarray) -> np.ndarray:
+        """Return the rays of longitudes and latitudes."""
+        x, y = points[..., 0], points[..., 1]
+        return np.stack([np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)], axis=-1)
 
 
 def _fisheye_points(lens: Lens, directions: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -62,6 +62,12 @@ class Intrinsics:
         points, shown = self.lens.project(rays)
         return points * (self.fx, self.fy) + (self.cx, self.cy), shown
 
+    def rays(self) -> np.ndarray:
+        """Return the unit rays [H, W, 3] of all pixels, for ``gs2d.render.rays.ray_map``; 0 where the lens has none."""
+        u = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        v = (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        return (self.lens or Lens("perspective")).unproject(np.stack(np.meshgrid(u, v), axis=-1))
+
     def scaled(self, width: int, height: int) -> Intrinsics:
         """Return the intrinsics for another image size."""
         sx, sy = width / self.width, height / self.height

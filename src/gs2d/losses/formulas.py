@@ -99,7 +99,7 @@ def normals_from_depth(
     Parameters
     ----------
     depth : Tensor [H, W] world units
-        Depth along the optical axis; 0 where nothing was hit.
+        Depth along the optical axis, or along ``camera.rays``; 0 where nothing was hit.
     camera : Camera
     mask : Tensor [H, W] bool, optional
         False = ignore the pixel: neither it nor its neighbours have a normal.
@@ -144,6 +144,8 @@ def normals_from_depth(
     x = ((i + 0.5 - cx) / fx).expand(height, width)
     y = ((j + 0.5 - cy) / fy)[:, None].expand(height, width)
     points = torch.stack([x * z, y * z, z], dim=-1)  # camera frame; the rotation to the world is applied last
+    if camera.rays is not None:
+        points = camera.rays[..., :3].to(depth) * z[..., None]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     right = points[1:-1, 2:] - points[1:-1, :-2]
     if edges == "camera":

@@ -134,6 +134,8 @@ class NormalConsistency(Loss):
 
     def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
         """Return the loss by the fused operation; its gradient to intrinsics that learn comes from the reference."""
+        if view.camera.rays is not None:  # the fused form is that of a pinhole
+            return self(output, view)
         images, weights = self._images(output, view), self._weights(output, view)
         how = NormalOptions(view.camera, view.mask, weights, self.edges == "camera", self.per_splat)
         value = operations.normal_consistency(*images, how, expected=view.weights.get(self.kind, 1.0))

@@ -44,10 +44,12 @@ class DepthMap:
 def depth_map(frame: RenderedView) -> DepthMap:
     """Convert a frame to numpy and check it.
 
-    Raises ShapeError if depth, colour or mask do not have the size of the camera, or a weight is negative or not
-    finite.
+    Raises ShapeError if depth, colour or mask do not have the size of the camera, a weight is negative or not finite,
+    or the camera has rays.
     """
     camera = frame.camera
+    if camera.rays is not None:
+        raise ShapeError("meshes need depth maps of pinhole cameras, got a camera with rays; render pinhole views")
     depth = _array(frame.depth)
     color = None if frame.color is None else _array(frame.color)
     valid = None if frame.valid is None else _array(frame.valid)

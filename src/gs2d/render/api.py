@@ -80,6 +80,14 @@ opacity o and colour c. A *pair* is a splat and a pixel. k^2 = 2 ln(o / alpha_mi
     L L^T = I + sigma^2 J J^T, the axes (s_u t_u, s_v t_v) become (s_u t_u, s_v t_v) L and the opacity o / det L. All
     other rules see these axes and this opacity; in 13, L does not depend on Tu and Tv. A splat with det L > 1e4 is
     culled.
+25. *Rays.* A camera with ``rays`` (``gs2d.render.rays.ray_map``) has in each pixel that unit ray r from its centre,
+    instead of a pinhole's. Depth is then distance: z is |hit - camera centre| and z_c is |p|, in all rules. In 4,
+    rho2d = density |p/|p| - r|^2 / lowpass_px^2, density = pixels per steradian around the pixel: a disc of directions
+    with the same area in pixels. Pixels without a ray show the background. In 13, p moves along two axes at right
+    angles to it, by 1/fx and 1/fy of the pinhole's Tu.z and Tv.z. In 14, the radius is the larger of sqrt(fx fy) times
+    the chord of the angle of the sphere of radius k max(s_u, s_v) around p, and lowpass_px k, at most half the longer
+    side; 0 if that is outside the cone around all rays. There is no Mip filter (24), 19 is "draw", and fx, fy, cx and
+    cy have no other effect. On the reference backend rays have gradients.
 """
 
 from __future__ import annotations
@@ -97,6 +105,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import attach_pose_grad, with_world_normals
+from gs2d.render.rays import MAX_DENSITY
 from gs2d.render.reference_contributors import first_contributors as first_of
 from gs2d.render.types import (
     MAX_COLOR,
@@ -202,6 +211,7 @@ def _checked_view(
 ) -> tuple[RasterSettings, Camera]:
     """Validate one view; return the settings for these splats, and the camera without gradients if grad is disabled."""
     settings = _checked(splats, settings, backend)
+    _check_rays(splats, camera, settings, backend)
     if settings.with_transmittance_depth and not settings.depth_width(camera) < 0.5:
         raise ShapeError(
             "RasterSettings.depth_width_px must be less than half the focal length "
@@ -223,6 +233,34 @@ def _checked_view(
     if not torch.is_grad_enabled() and (camera.pose is not None or camera.intrinsics is not None):
         camera = replace(camera, pose=None, intrinsics=None)
     return settings, camera
+
+
+def _check_rays(splats: Splats, camera: Camera, settings: RasterSettings, backend: Backend) -> None:
+    """Raise an error if a camera has rays that this backend cannot render with these settings (rule 25)."""
+    rays = camera.rays
+    if rays is None:
+        return
+    if not backend.takes_rays:
+        raise BackendError(f"backend {backend.name!r} renders pinhole cameras only, got rays: use cpu or reference")
+    check_dense("rays", rays)
+    check_shapes({"Camera.rays, a gs2d.render.rays.ray_map,": (rays, f"{camera.height} {camera.width} 4")})
+    if (rays.dtype, rays.device) != (splats.dtype, splats.device):
+        raise ShapeError(
+            f"rays must be {splats.dtype} on {splats.device} like the splats, got {rays.dtype} on {rays.device}"
+        )
+    if rays.requires_grad and torch.is_grad_enabled() and not backend.ray_gradients:
+        raise BackendError(
+            f"backend {backend.name!r} has no gradients of rays: detach them, or use backend='reference'"
+        )
+    x, y, z, density = rays.detach().unbind(dim=2)
+    away = (x * x + y * y + z * z - (density < MAX_DENSITY).to(x)).abs()  # of the squared length, 0 without a ray
+    if not (rays.is_contiguous() and bool((away < 1e-3).all()) and bool((density > 0).all())):  # False for NaN
+        raise ShapeError("Camera.rays must be contiguous and of unit length: make them with gs2d.render.rays.ray_map")
+    if settings.mip_px > 0 or settings.near_plane_policy != "draw" or camera.intrinsics is not None:
+        raise ShapeError(
+            "a camera with rays has no Mip filter, no camera plane and no gradient of intrinsics: set mip_px=0, "
+            "near_plane_policy='draw' and intrinsics=None"
+        )
 
 
 def splat_errors(
@@ -261,6 +299,7 @@ def splat_errors(
     _check_types(splats, camera, settings, image=image, mask=mask)
     chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
     settings = _checked(splats, settings, chosen)
+    _check_rays(splats, camera, settings, chosen)
     H, W = camera.height, camera.width
     arrays: dict[str, tuple[Tensor, str]] = {"image": (image, f"{H} {W} 3")}
     if mask is not None:
@@ -380,6 +419,8 @@ def first_contributors(
             f"first_contributors needs points of {splats.dtype} on {splats.device} like the splats and a positive "
             f"count, got {points.dtype} on {points.device} and {count}"
         )
+    if camera.rays is not None:
+        raise ShapeError("first_contributors takes points of a pinhole image, got a camera with rays")
     camera = replace(camera, pose=None, intrinsics=None)
     settings, camera = _checked_view(splats, camera, settings, get_backend("reference"), None)
     return first_of(splats, camera, points, count, settings)

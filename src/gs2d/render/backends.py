@@ -90,6 +90,8 @@ class Backend:
     name: str = ""
     device: str = "cpu"  # for the tensors of training, scoring and meshing
     lowpass_depths: tuple[str, ...] = ("center",)  # supported values of ``RasterSettings.lowpass_depth``
+    takes_rays: bool = False  # whether cameras may have rays (rule 25)
+    ray_gradients: bool = False  # whether these rays get gradients
     caches_views: bool = False  # whether :meth:`cache_view` is implemented
     slow: bool = False  # whether users who did not choose this backend get a warning
     about: str = ""  # details for ``gs2d doctor``

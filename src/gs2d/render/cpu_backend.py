@@ -30,6 +30,7 @@ from gs2d.render.cpu_passes import (
     ParameterGradients,
     address_of,
     forward,
+    kind_of,
     parameters_of,
     run,
     view_of,
@@ -49,7 +50,7 @@ class CpuBackend(KernelBackend):
     """
 
     name = "cpu"
-    caches_views = True
+    caches_views = takes_rays = True
 
     def __init__(self, chosen: Library | None = None, *, exact_masks: bool = True) -> None:
         self.dtype = (chosen or library.load()).dtype
@@ -93,7 +94,8 @@ class CpuBackend(KernelBackend):
         """Return the splat errors [N] of one view."""
         errors = torch.empty(len(scene.splats["means"]), dtype=self.dtype)
         view = view_of(scene.camera, scene.settings, self._exact_masks)
-        run(self._library(), "gs2d_splat_errors", view, parameters_of(scene.splats), image, mask, occlusion, errors)
+        name = "gs2d_splat_errors" + kind_of(view)
+        run(self._library(), name, view, parameters_of(scene.splats), image, mask, occlusion, errors)
         return errors
 
     def cache_view(

@@ -104,6 +104,8 @@ def cache_view(
     """
     if settings.sh_degree < 0:
         raise ShapeError("a cached view needs colours from harmonics, got plain colours (sh_degree -1)")
+    if camera.rays is not None:
+        return None  # there is no cache for cameras with rays
     height, width, count = camera.height, camera.width, len(rows)
     frame = forward(library, view_of(camera, settings, True), splats)[1]
     row_of = torch.full((len(splats["means"]),), -1, dtype=torch.int32)

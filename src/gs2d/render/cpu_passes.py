@@ -23,7 +23,7 @@ _View, _Parameters, Images, ImageGradients, ParameterGradients, Channels = (
     structure(name, "cpu/frame.h")
     for name in ("View", "Parameters", "Images", "ImageGradients", "ParameterGradients", "Features")
 )
-VIEW_LAYOUT = struct.Struct(f"{ctypes.sizeof(_View) // 8 - 3}d5i4x")
+VIEW_LAYOUT = struct.Struct(f"{ctypes.sizeof(_View) // 8 - 4}d5i4xP")
 _constants = attrgetter(*CONSTANTS)
 
 
@@ -52,7 +52,15 @@ def view_of(camera: Camera, settings: RasterSettings, exact_masks: bool) -> ctyp
         exact_masks,
         NEAR_PLANE_POLICIES.index(settings.near_plane_policy),
     )
-    return _View.from_buffer_copy(VIEW_LAYOUT.pack(*doubles, *integers))  # four times as fast as one field at a time
+    rays = 0 if camera.rays is None else camera.rays.data_ptr()  # the camera keeps it alive
+    return _View.from_buffer_copy(
+        VIEW_LAYOUT.pack(*doubles, *integers, rays)
+    )  # four times as fast as one field at a time
+
+
+def kind_of(view: ctypes.Structure) -> str:
+    """Return the end of the name of a function that takes this view: another one for cameras with rays."""
+    return "_rays" if view.rays else ""
 
 
 def address_of(tensor: Tensor | None) -> int | None:
@@ -83,7 +91,9 @@ def forward(
     images = {name: empty((H, W, 3) if name in ("color", "normal") else (H, W), dtype) for name in IMAGES}
     images["radii"] = empty((len(splats["means"]),), dtype)
     native, frame = Images(*(address_of(t) for t in images.values())), Frame(library)
-    run(library, "gs2d_raster_forward", view, parameters_of(splats), native, ctypes.byref(frame.pointer))
+    run(
+        library, "gs2d_raster_forward" + kind_of(view), view, parameters_of(splats), native, ctypes.byref(frame.pointer)
+    )
     if depth_width is not None:
         images["depth_transmittance"] = empty((H, W), dtype)
         run(

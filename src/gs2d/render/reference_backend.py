@@ -24,6 +24,7 @@ from gs2d.render.reference_projection import (
     contains_pixel,
     cutoff_squared,
     project,
+    ray_radii,
     screen_boxes,
     visible_rows,
 )
@@ -41,7 +42,7 @@ class ReferenceBackend(Backend):
     name = "reference"
     about = "plain torch, slow; float32 and float64, any device"
     lowpass_depths = ("center", "plane")
-    slow = True
+    takes_rays = ray_gradients = slow = True
 
     def rasterize(
         self,
@@ -146,6 +147,8 @@ def _rasterize(
     images = images.index_put((torch.cat(pixels),), torch.cat(values)).reshape(H, W, channels)
 
     longer = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) / 2
+    if camera.rays is not None:
+        longer = ray_radii(screen, cutoff_squared(screen.opacity, settings), camera, settings)
     radii = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
     radii[rows] = torch.where(contains_pixel(boxes), longer, 0.0).to(splats.dtype)
     return RenderOutput(
@@ -214,6 +217,8 @@ def _probe_shift(probe: Tensor, z_c: Tensor, pixels: int, camera: Camera) -> Ten
     if probe.shape[1] == 4:
         shift = shift + _PerPixel.apply(probe[:, 2:], pixels)
     half = torch.tensor([camera.width / 2, camera.height / 2], dtype=probe.dtype, device=probe.device)
+    if camera.rays is not None:  # the shift of Tu.z and Tv.z as one of p
+        half = half / half.new_tensor([camera.fx, camera.fy])
     return shift * z_c.detach()[:, None, None] * half
 
 

@@ -11,11 +11,13 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from gs2d.core.camera import Camera
 from gs2d.core.sh import num_coefficients, sh_to_rgb
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
+from gs2d.render.rays import MAX_DENSITY
 from gs2d.render.types import (
     MAX_COLOR,
     MAX_SIZE,
@@ -35,10 +37,11 @@ class ScreenSplats:
     """M splats that can touch the image of one camera, in blending order.
 
     The splat-to-pixel map (x z, y z, z) = (Tu, Tv, Tw) (u, v, 1) is stored relative to the projected centre c, for
-    float32 precision: Au = Tu - c_x Tw and Av = Tv - c_y Tw, whose third components are 0.
+    float32 precision: Au = Tu - c_x Tw and Av = Tv - c_y Tw, whose third components are 0. With rays (rule 25), Au and
+    Av are s_u t_u and s_v t_v in the camera frame, and Tw is (0, 0, |p|).
     """
 
-    center: Tensor  # [M, 2] px, c
+    center: Tensor  # [M, 2] px, c; of a camera with rays [M, 3] world units, p
     Au: Tensor  # [M, 3]
     Av: Tensor  # [M, 3]
     Tw: Tensor  # [M, 3] world units; depth z = Tw . (u, v, 1), so Tw.z = z_c
@@ -56,7 +59,7 @@ class PixelBlock:
     """A block of pixels and the splats whose boxes reach it."""
 
     pixels: Tensor  # [P] row-major index into the image
-    points: Tensor  # [P, 2] px, pixel centres
+    points: Tensor  # [P, 2] px, pixel centres; of a camera with rays [P, 4], rows of ``Camera.rays``
     splats: Tensor  # [n] index into ScreenSplats, in blending order
 
 
@@ -71,7 +74,7 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
     keep &= (used.scales <= MAX_SIZE).all(dim=1)
     at = _to_camera(used.means, camera)
     keep &= (at.abs() <= MAX_SIZE).all(dim=1)
-    depth = at[:, 2]
+    depth = at[:, 2] if camera.rays is None else at.norm(dim=1)
     keep &= depth > settings.near
     rows = keep.nonzero()[:, 0]
     screen = project(used, rows, camera, settings)
@@ -116,10 +119,13 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
         color = sh_to_rgb(splats.sh0[rows], splats.shN[rows], directions, degree)
     normal = frames[:, :, 2]
     away = (normal * to_splat).sum(dim=1).detach() > 0  # rule 8
+    center, Au, Av = focal * offset + principal, Au * third, Av * third
+    if camera.rays is not None:
+        center, Au, Av, Tw = p, H[:, :, 0], H[:, :, 1], pad(p.norm(dim=1, keepdim=True), (2, 0))
     screen = ScreenSplats(
-        center=focal * offset + principal,
-        Au=Au * third,
-        Av=Av * third,
+        center=center,
+        Au=Au,
+        Av=Av,
         Tw=Tw,
         opacity=splats.opacity_logits[rows].sigmoid(),
         color=color,
@@ -156,12 +162,41 @@ def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, s
     They are x_min, y_min, x_max and y_max, [M, 4] float64, px. Empty boxes have max < min.
     """
     k2 = cutoff_squared.detach().double()
+    if camera.rays is not None:  # the whole image; no splat is left out that a ray may reach
+        limits = torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, camera.width, camera.height]).to(k2).reshape(2, 4)
+        return limits[_reach(screen, k2, camera.rays, settings)[0].long()]
     exact = _boxes(screen, k2, camera, settings)
     if settings.near_plane_policy != "box":
         return exact
     k2 = torch.full_like(k2, settings.error_cutoff**2)
     crosses = _dot(k2, screen.Tw.detach().double(), screen.Tw.detach().double()) >= 0
     return torch.where(crosses[:, None], _square_boxes(screen, k2, camera, settings), exact)
+
+
+def _reach(screen: ScreenSplats, k2: Tensor, rays: Tensor, settings: RasterSettings) -> tuple[Tensor, Tensor]:
+    """Return which splats the rays of a camera may reach [M], and the chord [M] of the angle of each splat's sphere.
+
+    A chord is the distance of two unit vectors. The sphere around a disc has the radius k max(s_u, s_v).
+    """
+    p, sizes = (t.detach().double() for t in (screen.center, torch.stack([screen.Au, screen.Av], dim=1).norm(dim=2)))
+    ratio = (k2.sqrt() * sizes.amax(dim=1) / p.norm(dim=1)).clamp(max=1)
+    chord = torch.where(ratio < 1, ratio * (2 / (1 + (1 - ratio**2).sqrt())).sqrt(), 2.0)
+    shown = rays.detach().double()[rays[..., 3] < MAX_DENSITY]  # [P, 4]
+    if not len(shown):
+        return torch.zeros_like(ratio, dtype=torch.bool), chord
+    axis = normalize(shown[:, :3].sum(dim=0), dim=0)
+    around = (shown[:, :3] - axis).norm(dim=1).max()
+    disc = settings.clamp_px * k2.sqrt() / shown[:, 3].min().sqrt()
+    return (normalize(p, dim=1) - axis).norm(dim=1) <= around + torch.maximum(chord, disc) + 1e-6, chord
+
+
+def ray_radii(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
+    """Return the radii [M] px of a camera with rays, of splats that a ray may reach (rule 25)."""
+    assert camera.rays is not None
+    k2 = cutoff_squared.detach().double()
+    chord = _reach(screen, k2, camera.rays, settings)[1]
+    radii = torch.maximum(math.sqrt(camera.fx * camera.fy) * chord, settings.clamp_px * k2.sqrt())
+    return radii.clamp(max=max(camera.width, camera.height) / 2)
 
 
 def _boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
@@ -232,6 +267,8 @@ def blocks(boxes: Tensor, camera: Camera, dtype: torch.dtype) -> Iterator[PixelB
             j = torch.arange(y, y_end, device=boxes.device)
             pixels = (j[:, None] * camera.width + i).reshape(-1)
             points = torch.stack([pixels % camera.width, pixels // camera.width], dim=1).to(dtype) + 0.5
+            if camera.rays is not None:
+                points = camera.rays.reshape(-1, 4)[pixels]
             step = max(1, MAX_PAIRS // len(ids))
             for start in range(0, len(pixels), step):
                 yield PixelBlock(pixels[start : start + step], points[start : start + step], ids)

@@ -23,6 +23,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.api import check_dense, rasterize, rasterize_features
 from gs2d.render.backends import Backend, get_backend
+from gs2d.render.rays import ray_map
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
 COLORS = 3  # channels in ``sh0``
@@ -104,6 +105,7 @@ def rasterize_2dgs(
     sh_degree: int | None = None,
     backgrounds: Tensor | None = None,
     screen_probe: Tensor | None = None,
+    rays: Tensor | None = None,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
     backend: str | Backend = "auto",
 ) -> Rasterization:
@@ -131,6 +133,9 @@ def rasterize_2dgs(
         Background; default 0. In [0, 1] with ``sh_degree``.
     screen_probe : Tensor [C, N, 2] or [C, N, 4], optional
         Zeros that require a gradient, which is the densification signal of 2DGS and AbsGS (rule 13).
+    rays : Tensor [C, H, W, 3] or [H, W, 3], optional
+        Directions of the pixels in the camera frame, of any length, instead of those of a pinhole: fisheyes, panoramas,
+        LiDAR. 0: the pixel has no ray. Depths are distances, and ``Ks`` only sets a scale (rule 25).
     settings : RasterSettings
         The constants; ``background`` and ``sh_degree`` are ignored.
     backend : str or Backend
@@ -176,11 +181,15 @@ def rasterize_2dgs(
     if torch.compiler.is_compiling() or captured:
         if not isinstance(backend, str):
             raise BackendError(f"a captured graph needs the name of a backend: use backend={backend.name!r}")
+        if rays is not None:
+            raise BackendError(
+                "a captured graph renders pinhole cameras only, got rays: call rasterize_2dgs outside of it"
+            )
         constants = [float(getattr(settings, name)) for name in CONSTANTS]
         choices = (settings.lowpass_depth, settings.near_plane_policy, settings.with_distortion, backend)
         degree = PLAIN_COLORS if sh_degree is None else sh_degree
         return Rasterization(*_operator(*tensors, width, height, degree, constants, *choices))
-    return _render(tensors, (width, height), sh_degree, settings, backend)
+    return _render(tensors, (width, height), sh_degree, settings, backend, rays)
 
 
 class _Tensors(NamedTuple):
@@ -228,10 +237,17 @@ def _render(
     sh_degree: int | None,
     settings: RasterSettings,
     backend: str | Backend,
+    rays: Tensor | None = None,
 ) -> Rasterization:
     """Render each camera with :func:`gs2d.render.api.rasterize`."""
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe = tensors
     cameras = _cameras(viewmats, Ks, *size)
+    if rays is not None:
+        check_dense("rays", rays)
+        layout = f"{'C ' * (rays.dim() == 4)}{size[1]} {size[0]} 3"
+        check_shapes({"rays": (rays, layout), "viewmats": (viewmats, "C 4 4")})
+        maps = [ray_map(each) for each in rays] if rays.dim() == 4 else [ray_map(rays)] * len(cameras)
+        cameras = [replace(camera, rays=own) for camera, own in zip(cameras, maps, strict=True)]
     count, channels = len(cameras), _check(tensors, sh_degree)
     if screen_probe is not None and screen_probe.shape[:-1] != (count, len(means)):
         raise ShapeError(

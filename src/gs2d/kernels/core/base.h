@@ -14,6 +14,12 @@
 #define GS2D_UNROLL _Pragma("GCC unroll 16")
 #endif
 
+// With GS2D_RAYS 1 the rasterizer is compiled for cameras with any ray per pixel, in a namespace of its own, else for
+// pinhole cameras; a build has both (CMakeLists.txt).
+#if GS2D_RAYS
+#define gs2d gs2d_rays
+#endif
+
 namespace gs2d {
 
 constexpr double LN2 = 0.69314718055994530942;

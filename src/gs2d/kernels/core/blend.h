@@ -21,10 +21,16 @@ template <class V> struct PlaneAt {
     V X, Y, I;
 };
 
+#if GS2D_RAYS
+template <class V> GS2D_HD PlaneAt<V> plane_at(const Record<V>& s, Vec3<V> ray) {
+    return {dot(s.row0, ray), dot(s.row1, ray), dot(s.row2, ray)};
+}
+#else
 // dx, dy: pixel centre minus projected splat centre, in px.
 template <class V> GS2D_HD PlaneAt<V> plane_at(const Record<V>& s, V dx, V dy) {
     return {fma(s.au, dx, s.bu * dy), fma(s.av, dx, s.bv * dy), fma(s.ai, dx, fma(s.bi, dy, s.iz))};
 }
+#endif
 
 // A splat at a pixel. If the low-pass filter determines rho, u = v = 0 and the depth is z_c. Skipped pairs have
 // alpha = 0.
@@ -47,9 +53,10 @@ template <class V> GS2D_HD Hit<V> meet_plane(const PlaneAt<V>& p) {
 }
 
 // Intersects any splat; no member is NaN or infinite. zc = 1 / iz.
-template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V dy, const BlendLimits<V>& k) {
+// offset2: squared distance from the projected centre, px^2.
+template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V offset2, const BlendLimits<V>& k) {
     Hit<V> h = meet_plane(p);
-    const V rho2d = fma(dx, dx, dy * dy) * k.inv_lowpass2;
+    const V rho2d = offset2 * k.inv_lowpass2;
     h.ray = (p.I > V(0)) & (h.rho <= rho2d);
     h.rho = select(h.ray, h.rho, rho2d);
     h.u = keep(h.ray, h.u), h.v = keep(h.ray, h.v);
@@ -57,6 +64,7 @@ template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V 
     return h;
 }
 
+#if !GS2D_RAYS
 // Returns the least 1 / z for which the plane determines rho at every pixel: rho3d = d^T A d z^2 is at most
 // rho2d = d^T d / lowpass_px^2 if the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. Slightly increased to
 // allow for rounding.
@@ -72,6 +80,7 @@ template <class V> GS2D_HD mask_t<V> is_plain(V dx, V dy, V ai, V bi, V iz, V pl
     const V middle = fma(ai, dx, fma(bi, dy, iz)), range = half_side * (abs(ai) + abs(bi));
     return (middle - range >= plain_from) & ((middle + range) * near < V(0.9999f));
 }
+#endif
 
 // Alpha of a hit (not yet limited to alpha_max) and its logarithm. Alpha is 0 for skipped pairs. All depths of a plain
 // splat are beyond `near`, so the plain variants do not test the depth.
@@ -86,16 +95,18 @@ template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, const Hit<V>& h, cons
     return select(h.depth >= k.near, log2_alpha_of(log2_opacity, h.rho), V(-1e30));
 }
 
+#if !GS2D_RAYS
 // Evaluates the plane and alpha.
 template <class V>
 GS2D_HD Hit<V> intersect(const Record<V>& s, const PlaneAt<V>& p, V zc, V dx, V dy, const BlendLimits<V>& k) {
-    Hit<V> h = meet(p, s.iz, zc, dx, dy, k);
+    Hit<V> h = meet(p, s.iz, zc, fma(dx, dx, dy * dy), k);
     h.alpha = alpha_of(log2_alpha_of(s.log2_opacity, h, k), k);
     return h;
 }
 template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V zc, V dx, V dy, const BlendLimits<V>& k) {
     return intersect(s, plane_at(s, dx, dy), zc, dx, dy, k);
 }
+#endif
 
 // State of a pixel during blending. The distortion works with q = 1/z - 1/z of the first pair: the mapped depth is
 // affine in 1/z, and differences near 0 keep precision in float32.
@@ -198,6 +209,9 @@ template <class V> struct PairSums {
     V red, green, blue, nx, ny, nz;
     V lowpass_x, lowpass_y;
     V abs_x, abs_y;
+#if GS2D_RAYS  // X, Xx, Xy: times x, y and z of the ray; Y and I likewise
+    V lowpass_z;
+#endif
 };
 
 // Inputs of the sums of a splat at one pixel, in addition to the hit and the upstream gradient.
@@ -254,6 +268,54 @@ GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, Pai
         sums.nx = fma(p.w, g.nx, sums.nx), sums.ny = fma(p.w, g.ny, sums.ny), sums.nz = fma(p.w, g.nz, sums.nz);
 }
 
+#if GS2D_RAYS
+// What the geometry sums of a splat need of a pixel.
+template <class V> struct RayFrom {
+    Vec3<V> ray, away;  // away: direction of the splat's centre minus the ray
+    V density;
+};
+
+// As below. `unit_x` and `unit_y`: row0, row1 and row2 times each of the two axes at right angles to p.
+template <bool Geo, bool Abs, bool Filtered, class V>
+GS2D_HD void add_geometry(const RayFrom<V>& at, Vec3<V> unit_x, Vec3<V> unit_y, V t, V tu, V tv, V rho, V inverse_depth,
+                          mask_t<V> ray, const PairGradient<V>& p, PairSums<V>& sums) {
+    V gI = t * rho;
+    if constexpr (Geo) {
+        gI = fma(t, rho, p.I);
+        if constexpr (Filtered) sums.iz = sums.iz + select(ray, V(0), p.I);
+    }
+    if constexpr (Filtered) gI = keep(ray, gI);
+    const Vec3<V> r = at.ray;
+    sums.X = fma(tu, r.x, sums.X), sums.Xx = fma(tu, r.y, sums.Xx), sums.Xy = fma(tu, r.z, sums.Xy);
+    sums.Y = fma(tv, r.x, sums.Y), sums.Yx = fma(tv, r.y, sums.Yx), sums.Yy = fma(tv, r.z, sums.Yy);
+    sums.I = fma(gI, r.x, sums.I), sums.Ix = fma(gI, r.y, sums.Ix), sums.Iy = fma(gI, r.z, sums.Iy);
+    if constexpr (Abs) {
+        const Vec3<V> of_plane = {tu, tv, -gI};
+        sums.abs_x = sums.abs_x + abs(inverse_depth * dot(unit_x, of_plane));
+        sums.abs_y = sums.abs_y + abs(inverse_depth * dot(unit_y, of_plane));
+    }
+    if constexpr (Filtered) {
+        const V filtered = select(ray, V(0), p.ln_alpha) * at.density;
+        sums.lowpass_x = fma(filtered, at.away.x, sums.lowpass_x);
+        sums.lowpass_y = fma(filtered, at.away.y, sums.lowpass_y);
+        sums.lowpass_z = fma(filtered, at.away.z, sums.lowpass_z);
+    }
+}
+
+// Returns dL/d(record) from the sums, per lane; the caller sums over lanes. zc = |p|; needed only if abs_x and abs_y
+// are computed.
+template <class V>
+GS2D_HD RecordGradient<V> finish(const Record<V>&, V zc, const PairSums<V>& a, const BlendLimits<V>& k) {
+    RecordGradient<V> g;
+    g.row0 = {-a.X, -a.Xx, -a.Xy}, g.row1 = {-a.Y, -a.Yx, -a.Yy}, g.row2 = {a.I, a.Ix, a.Iy};
+    g.ln_opacity = a.ln_alpha;
+    g.red = a.red, g.green = a.green, g.blue = a.blue, g.nx = a.nx, g.ny = a.ny, g.nz = a.nz;
+    g.direction = -k.inv_lowpass2 * Vec3<V>{a.lowpass_x, a.lowpass_y, a.lowpass_z};
+    g.iz = a.iz;
+    g.abs_x = zc * a.abs_x, g.abs_y = zc * a.abs_y;
+    return g;
+}
+#else
 // Abs: compute the AbsGS signal. Filtered: the low-pass filter may apply to a pair (otherwise the sums are the same).
 // Column: dx is the same in all calls of these sums; finish_column multiplies by it once instead.
 // tu, tv are -dL/dX, -dL/dY, 0 if the filter applies: rho = (X^2 + Y^2) z^2, z = 1 / I.
@@ -295,6 +357,8 @@ GS2D_HD V composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const B
     return p.w;
 }
 
+#endif
+
 // Returns the weight of one splat at one pixel, front to back, as in `composite_weight`. T is 0 for stopped pixels.
 template <class V> GS2D_HD V pass_weight(const Hit<V>& h, const BlendLimits<V>& k, V& T) {
     const V alpha = min(h.alpha, k.alpha_max), after = fnma(alpha, T, T);
@@ -310,6 +374,7 @@ GS2D_HD void composite_color_vjp(const Hit<V>& h, const BlendLimits<V>& k, Vec3<
     sum = axpy(pass_weight(h, k, T), g_color, sum);
 }
 
+#if !GS2D_RAYS
 // Completes the sums of `Column` calls.
 template <class V> GS2D_HD void finish_column(V dx, PairSums<V>& a) {
     a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Ix = dx * a.I, a.lowpass_x = dx * a.lowpass_x;
@@ -329,5 +394,6 @@ GS2D_HD RecordGradient<V> finish(const Record<V>& s, V zc, const PairSums<V>& a,
     g.abs_x = zc * a.abs_x, g.abs_y = zc * a.abs_y;
     return g;
 }
+#endif
 
 }  // namespace gs2d

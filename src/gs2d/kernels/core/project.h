@@ -33,6 +33,7 @@ template <class V> struct SplatParameters {
     V logit;
 };
 
+#if !GS2D_RAYS  // else core/rays.h has its own record
 // The screen record: 16 reals, one cache line in float. Field order is the memory order.
 template <class V> struct Record {
     V cx, cy, au, bu, av, bv, ai, bi, iz;
@@ -53,6 +54,7 @@ template <class V> struct RecordGradient {
     V abs_x, abs_y;  // sums of absolute values for the densification signal, per px
 };
 constexpr int GRADIENT = RECORD, GRADIENT_EXTRA = 4;  // lowpass_cx to abs_y are extra
+#endif
 
 // Intermediate values of both passes.
 template <class V> struct Frame3 {
@@ -136,6 +138,7 @@ template <class V> GS2D_HD mask_t<V> in_range(const SplatParameters<V>& p, const
 // The same test for the sum of the absolute coefficients of a colour.
 template <class V> GS2D_HD mask_t<V> color_in_range(V sum) { return sum <= V(float(MAX_COLOR)); }
 
+#if !GS2D_RAYS
 // Computes the record without the colour.
 template <class V, class S>
 GS2D_HD Record<V> project(const SplatParameters<V>& s, const Frame3<V>& f, const PinholeCamera<S>& cam) {
@@ -151,6 +154,7 @@ GS2D_HD Record<V> project(const SplatParameters<V>& s, const Frame3<V>& f, const
     r.nx = f.sign * f.n_world.x, r.ny = f.sign * f.n_world.y, r.nz = f.sign * f.n_world.z;
     return r;
 }
+#endif
 
 template <class V> struct ParameterGradient {
     Vec3<V> mean;
@@ -158,12 +162,41 @@ template <class V> struct ParameterGradient {
     V probe_x, probe_y;  // z_c dL/d(Tu.z), z_c dL/d(Tv.z), per px; without the low-pass branch
 };
 
+// Sets all gradients but those of the probe from those of the columns of P, a, b and p, and of the record's normal and
+// ln_opacity. `g_direction`, the gradient with respect to f.to_splat, comes from sh.h.
+template <class V, class S>
+GS2D_HD void parameters_vjp(const SplatParameters<V>& s, const Frame3<V>& f, Vec3<V> ga, Vec3<V> gb, Vec3<V> gp,
+                            Vec3<V> g_normal, V g_ln_opacity, Vec3<V> g_direction, const PinholeCamera<S>& cam,
+                            ParameterGradient<V>& out) {
+    const V two = V(S(2));
+    out.log_su = dot(ga, f.a);
+    out.log_sv = dot(gb, f.b);
+    const V su = sqrt(dot(f.a, f.a)), sv = sqrt(dot(f.b, f.b));
+    const Vec3<V> gu = rotate_back(cam.R, su * ga), gv = rotate_back(cam.R, sv * gb);  // gradients of t_u, t_v
+    const Vec3<V> gn = f.sign * g_normal;
+    const V w = f.qw, x = f.qx, y = f.qy, z = f.qz;
+    const V d21 = gv.z - gn.y, d02 = gn.x - gu.z, d10 = gu.y - gv.x;  // antisymmetric and symmetric parts
+    const V s01 = gv.x + gu.y, s02 = gn.x + gu.z, s12 = gn.y + gv.z;
+    const V hw = fma(x, d21, fma(y, d02, z * d10));
+    const V hx = fma(w, d21, fma(y, s01, z * s02)) - two * x * (gv.y + gn.z);
+    const V hy = fma(w, d02, fma(x, s01, z * s12)) - two * y * (gu.x + gn.z);
+    const V hz = fma(w, d10, fma(x, s02, y * s12)) - two * z * (gu.x + gv.y);
+    const V along = fma(w, hw, fma(x, hx, fma(y, hy, z * hz))), k = two * f.inverse_norm;
+    out.qw = k * fnma(along, w, hw), out.qx = k * fnma(along, x, hx);
+    out.qy = k * fnma(along, y, hy), out.qz = k * fnma(along, z, hz);
+
+    const V radial = dot(g_direction, f.to_splat);
+    out.mean = rotate_back(cam.R, gp) + f.inverse_distance * axpy(-radial, f.to_splat, g_direction);
+    out.logit = g_ln_opacity * (V(S(1)) / (V(S(1)) + exp(s.logit)));  // d ln o / d logit = 1 - o
+}
+
+#if !GS2D_RAYS
 // Vector-Jacobian product of `project`. `g_direction`, the gradient with respect to f.to_splat, comes from sh.h.
 template <class V, class S>
 GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Frame3<V>& f, const Record<V>& r,
                                          const RecordGradient<V>& g, Vec3<V> g_direction, const PinholeCamera<S>& cam) {
     ParameterGradient<V> out;
-    const V two = V(S(2)), kx = V(S(1) / cam.fx), ky = V(S(1) / cam.fy);
+    const V kx = V(S(1) / cam.fx), ky = V(S(1) / cam.fy);
     // dL/dP = -R^T G R^T with R = P^-1, G = dL/dR (its third column is 0).
     const V g00 = kx * g.au, g01 = ky * g.bu, g10 = kx * g.av, g11 = ky * g.bv, g20 = kx * g.ai, g21 = ky * g.bi;
     const auto column = [&](Vec3<V> row) {  // column of dL/dP that belongs to this row of R
@@ -182,25 +215,7 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
     const V slide = fma(fx_z * f.p.x, g.cx + g.lowpass_cx, fy_z * f.p.y * (g.cy + g.lowpass_cy));
     gp.z = fnma(r.iz, fma(r.iz, g.iz, slide), gp.z);  // iz = 1 / z_c
 
-    out.log_su = dot(ga, f.a);
-    out.log_sv = dot(gb, f.b);
-    const V su = sqrt(dot(f.a, f.a)), sv = sqrt(dot(f.b, f.b));
-    const Vec3<V> gu = rotate_back(cam.R, su * ga), gv = rotate_back(cam.R, sv * gb);  // gradients of t_u, t_v
-    const Vec3<V> gn = f.sign * Vec3<V>{g.nx, g.ny, g.nz};
-    const V w = f.qw, x = f.qx, y = f.qy, z = f.qz;
-    const V d21 = gv.z - gn.y, d02 = gn.x - gu.z, d10 = gu.y - gv.x;  // antisymmetric and symmetric parts
-    const V s01 = gv.x + gu.y, s02 = gn.x + gu.z, s12 = gn.y + gv.z;
-    const V hw = fma(x, d21, fma(y, d02, z * d10));
-    const V hx = fma(w, d21, fma(y, s01, z * s02)) - two * x * (gv.y + gn.z);
-    const V hy = fma(w, d02, fma(x, s01, z * s12)) - two * y * (gu.x + gn.z);
-    const V hz = fma(w, d10, fma(x, s02, y * s12)) - two * z * (gu.x + gv.y);
-    const V along = fma(w, hw, fma(x, hx, fma(y, hy, z * hz))), k = two * f.inverse_norm;
-    out.qw = k * fnma(along, w, hw), out.qx = k * fnma(along, x, hx);
-    out.qy = k * fnma(along, y, hy), out.qz = k * fnma(along, z, hz);
-
-    const V radial = dot(g_direction, f.to_splat);
-    out.mean = rotate_back(cam.R, gp) + f.inverse_distance * axpy(-radial, f.to_splat, g_direction);
-    out.logit = g.ln_opacity * (V(S(1)) / (V(S(1)) + exp(s.logit)));  // d ln o / d logit = 1 - o
+    parameters_vjp(s, f, ga, gb, gp, {g.nx, g.ny, g.nz}, g.ln_opacity, g_direction, cam, out);
     return out;
 }
 
@@ -296,5 +311,10 @@ GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S l
     o.k = sqrt(fma(k2, V(S(1.0002)), V(S(1e-4))));
     return o;
 }
+#endif
 
 }  // namespace gs2d
+
+#if GS2D_RAYS
+#include "core/rays.h"
+#endif

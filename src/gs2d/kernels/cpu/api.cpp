@@ -3,6 +3,7 @@
 
 #include "cpu/export.h"
 #include "cpu/frame.h"
+#include "cpu/ray_entries.h"
 #include "cpu/stages.h"
 
 namespace gs2d {
@@ -17,6 +18,9 @@ template <class F> void for_each_buffer(Frame& f, F&& visit) {
     visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.taken), visit(f.saved),
         visit(f.depth_slope), visit(f.scratch);
     visit(f.histogram), visit(f.slot_begin), visit(f.chunks), visit(f.own_sums), visit(f.feature_planes);
+#if GS2D_RAYS
+    visit(f.areas), visit(f.ray_tiles);
+#endif
     visit(f.target), visit(f.splat_begin), visit(f.splat_slots);
 }
 
@@ -93,11 +97,13 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
 
 // Computes the depth by transmittance [H, W] of the last rendered view; `images` are its outputs.
 GS2D_EXPORT int gs2d_transmittance_depth(Frame* frame, const Images* images, double width, real* depth) {
+    if (OF_RAYS(&frame->view)) return gs2d_rays_transmittance_depth(frame, images, width, depth);
     return find_transmittance_depth(*frame, images->alpha, images->depth_median, width, depth) ? OK : NO_MEMORY;
 }
 
 // Renders further channels of the last rendered view.
 GS2D_EXPORT int gs2d_raster_features(Frame* frame, const Features* features) {
+    if (OF_RAYS(&frame->view)) return gs2d_rays_features(frame, features);
     return blend_features(*frame, *features) ? OK : NO_MEMORY;
 }
 
@@ -106,6 +112,8 @@ GS2D_EXPORT int gs2d_raster_features(Frame* frame, const Features* features) {
 GS2D_EXPORT int gs2d_raster_backward_features(Frame* frame, const Parameters* splats, const Images* images,
                                               const ImageGradients* upstream, const ParameterGradients* out,
                                               real* intrinsics, const Features* features) {
+    if (OF_RAYS(&frame->view))
+        return gs2d_rays_backward(frame, splats, images, upstream, out, intrinsics, features);
     const bool geometry = intrinsics || features || wants_geometry(*out);
     if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out, geometry, features)) return NO_MEMORY;
     StageClock clock;
@@ -114,6 +122,7 @@ GS2D_EXPORT int gs2d_raster_backward_features(Frame* frame, const Parameters* sp
     return OK;
 }
 
+#if !GS2D_RAYS
 GS2D_EXPORT int gs2d_raster_backward_intrinsics(Frame* frame, const Parameters* splats, const Images* images,
                                                 const ImageGradients* upstream, const ParameterGradients* out,
                                                 real* intrinsics) {
@@ -124,6 +133,7 @@ GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, con
                                      const ImageGradients* upstream, const ParameterGradients* out) {
     return gs2d_raster_backward_features(frame, splats, images, upstream, out, nullptr, nullptr);
 }
+#endif
 
 // Computes the inner sum of E_i: `image` [H, W, 3], `mask` [H, W] bytes or null, `errors` [N].
 GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, const real* image, const uint8_t* mask,
@@ -138,10 +148,14 @@ GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, co
     return ok ? OK : NO_MEMORY;
 }
 
-GS2D_EXPORT void gs2d_frame_release(Frame* frame) { give_back(frame); }
+GS2D_EXPORT void gs2d_frame_release(Frame* frame) {
+    if (frame && OF_RAYS(&frame->view)) return gs2d_rays_release(frame);
+    give_back(frame);
+}
 
 // Returns the bytes that a view occupies between forward and backward pass.
 GS2D_EXPORT int64_t gs2d_frame_bytes(Frame* frame) {
+    if (OF_RAYS(&frame->view)) return gs2d_rays_bytes(frame);
     size_t bytes = 0;
     for_each_buffer(*frame, [&](auto& buffer) { bytes += buffer.capacity * sizeof(*buffer.data); });
     return static_cast<int64_t>(bytes);
@@ -149,6 +163,9 @@ GS2D_EXPORT int64_t gs2d_frame_bytes(Frame* frame) {
 
 // Frees the memory reserved for the next view.
 GS2D_EXPORT void gs2d_trim() {
+#if !GS2D_RAYS
+    gs2d_rays_trim();
+#endif
     pthread_mutex_lock(&free_lock);
     Frame* f = free_frames;
     free_frames = nullptr;
@@ -161,3 +178,14 @@ GS2D_EXPORT void gs2d_trim() {
         f = next;
     }
 }
+
+#if !GS2D_RAYS
+// The same for a view with rays. These are separate names, so that an older library is an error instead of a pinhole.
+GS2D_EXPORT int gs2d_raster_forward_rays(const View* view, const Parameters* splats, const Images* out, Frame** frame) {
+    return gs2d_rays_forward(view, splats, out, frame);
+}
+GS2D_EXPORT int gs2d_splat_errors_rays(const View* view, const Parameters* splats, const real* image,
+                                       const uint8_t* mask, int occlusion, real* errors) {
+    return gs2d_rays_splat_errors(view, splats, image, mask, occlusion, errors);
+}
+#endif

@@ -110,7 +110,7 @@ RowLines images_read(const Frame& f, const Images& images, const ImageGradients&
 // Computes gradients of the colours only, not of geometry and opacity.
 void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
                     const BlendLimits<V>& limits, RowsAhead next, TileFeatures) {
-    const Centres centres(area);
+    const Centres centres(f, area);
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
     Interest interest(entry, count, rows);
@@ -128,7 +128,7 @@ void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows,
             const int b = __builtin_ctz(blocks);
             const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
             V pixel_T = at(T);
-            const Hit<V> hit = hit_at(splat, zc, planes.at(b), entry->plain(), centres, b, limits);
+            const Hit<V> hit = hit_at(splat, zc, planes.at(b, centres), entry->plain(), centres, b, limits);
             composite_color_vjp(hit, limits, {at(RED), at(GREEN), at(BLUE)}, pixel_T, sum);
             store(&s[T][b * LANES], pixel_T);
         }

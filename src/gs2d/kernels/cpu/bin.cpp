@@ -2,9 +2,25 @@
 #include "cpu/frame.h"
 #include "cpu/stages.h"
 #include "cpu/threads.h"
+#if GS2D_RAYS
+#include "cpu/ray_bounds.h"
+#endif
 
 namespace gs2d {
 namespace {
+
+// Calls visit(tile) for each tile of the visible splat i.
+template <class F> inline void for_each_tile(const Frame& f, int64_t i, F&& visit) {
+#if GS2D_RAYS
+    constexpr int64_t AHEAD = 16;  // prefetch distance
+    if (i + AHEAD < f.visible) __builtin_prefetch(&f.ray_tiles[f.order[i + AHEAD].splat]);
+    for_each_ray_tile(f, f.order[i].splat, visit);
+#else
+    const TileRect r = f.ordered_rects[i];
+    for (int y = r.y0; y < r.y1; ++y)
+        for (int x = r.x0; x < r.x1; ++x) visit(int64_t(y) * f.tiles_x + x);
+#endif
+}
 
 constexpr int64_t CHUNKS = 16;  // pieces of the depth order; fixed, so that the lists do not depend on the thread count
 
@@ -66,11 +82,8 @@ bool bin_splats(Frame& f) {
     parallel_for(CHUNKS, [&](int64_t c) {
         uint32_t* h = &f.histogram[c * tiles];
         memset(h, 0, tiles * sizeof(uint32_t));
-        for (int64_t i = c * grain; i < (c + 1) * grain && i < f.visible; ++i) {
-            const TileRect r = f.ordered_rects[i];
-            for (int y = r.y0; y < r.y1; ++y)
-                for (int x = r.x0; x < r.x1; ++x) ++h[int64_t(y) * f.tiles_x + x];
-        }
+        for (int64_t i = c * grain; i < (c + 1) * grain && i < f.visible; ++i)
+            for_each_tile(f, i, [&](int64_t tile) { ++h[tile]; });
     });
     int64_t at = 0;
     for (int64_t t = 0; t < tiles; ++t) {
@@ -88,13 +101,8 @@ bool bin_splats(Frame& f) {
     parallel_for(CHUNKS, [&](int64_t c) {
         uint32_t* h = &f.histogram[c * tiles];
         for (int64_t i = c * grain; i < (c + 1) * grain && i < f.visible; ++i) {
-            const TileRect r = f.ordered_rects[i];
             const uint32_t splat = f.order[i].splat;
-            for (int y = r.y0; y < r.y1; ++y)
-                for (int x = r.x0; x < r.x1; ++x) {
-                    const int64_t t = int64_t(y) * f.tiles_x + x;
-                    f.entries[f.tile_begin[t] + h[t]++].word = splat;
-                }
+            for_each_tile(f, i, [&](int64_t tile) { f.entries[f.tile_begin[tile] + h[tile]++].word = splat; });
         }
     });
     clock.done(BIN);

@@ -44,7 +44,7 @@ void fill_tile(const Frame& f, int64_t tile, const int32_t* row_of, const Cached
     memset(frozen, 0, sizeof(real) * 3 * PIXELS);
     for (int b = 0; b < BLOCKS; ++b)
         store(T + b * LANES, keep(lanes_inside(block_x(b), block_y(b), area.width, area.height), V(1)));
-    const Centres centres(area);
+    const Centres centres(f, area);
     int64_t to = c.tile_entries[tile];
     real* weights = c.weights + c.tile_blocks[tile] * LANES;
     const Entry* const begin = &f.entries[f.tile_begin[tile]];
@@ -61,7 +61,7 @@ void fill_tile(const Frame& f, int64_t tile, const int32_t* row_of, const Cached
         }
         for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks), at = b * LANES;
-            const Hit<V> hit = hit_at(splat, zc, planes.at(b), entry->plain(), centres, b, limits);
+            const Hit<V> hit = hit_at(splat, zc, planes.at(b, centres), entry->plain(), centres, b, limits);
             V pixel_T = load(T + at);
             if (row >= 0) {
                 Vec3<V> sum = {V(0), V(0), V(0)};

@@ -1,7 +1,7 @@
 // Splat errors: the sum over a splat's footprint of |its colour - image| (rule 17 of the contract).
 #include "cpu/frame.h"
+#include "cpu/planes.h"
 #include "cpu/threads.h"
-#include "cpu/tile.h"
 
 namespace gs2d {
 namespace {
@@ -50,6 +50,7 @@ bool list_entries(Frame& f) {
 
 }  // namespace
 
+#if !GS2D_RAYS  // else the lists of tiles are used
 bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
     if (!load_target(f, image, mask)) return false;
     const BlendLimits<V> limits = limits_of(f.view);
@@ -89,7 +90,11 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
     return true;
 }
 
-bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
+#endif
+
+namespace {
+
+template <bool Occlusion> bool listed_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
     if (!bin_splats(f) || !list_entries(f) || !load_target(f, image, mask) || !f.saved.reserve(f.tile_begin[f.tiles]))
         return false;
     const BlendLimits<V> limits = limits_of(f.view);
@@ -97,7 +102,9 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
     parallel_for(f.tiles, [&](int64_t tile) {
         const TileArea a = tile_area(f, tile);
         const real* target = &f.target[size_t(tile) * PLANES * PIXELS];
-        const V lx = lane_x(a.x0), ly = lane_y(a.y0);
+        const Centres centres(f, a);
+        const TileBounds bounds(centres, a);
+        [[maybe_unused]] const V lx = lane_x(a.x0), ly = lane_y(a.y0);
         alignas(64) real T[PIXELS];
         for (real& t : T) t = 1;
         uint32_t touched[LANES];
@@ -105,7 +112,7 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
             if ((e - begin) % LANES == 0) {
                 uint32_t splats[LANES];
                 for (int k = 0; k < LANES; ++k) splats[k] = f.entries[e + k < end ? e + k : end - 1].splat();
-                blocks_touched(f, Footprints(f, splats), V(real(a.x0)), V(real(a.y0)), touched);
+                blocks_touched(f, Footprints(f, splats), bounds, touched);
             }
             const uint32_t splat = f.entries[e].splat();
             const Record<V> s = broadcast(&f.records[size_t(splat) * RECORD]);
@@ -113,13 +120,18 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
             V total = V(0);
             for (uint32_t left = touched[(e - begin) % LANES]; left; left &= left - 1) {
                 const int b = __builtin_ctz(left);
+#if GS2D_RAYS
+                const Hit<V> h = hit_at(s, zc, plane_at(s, centres.rays.at(b)), false, centres, b, limits);
+#else
                 const V x = lx + V(real(block_x(b))), y = ly + V(real(block_y(b)));
                 const Hit<V> h = intersect(s, zc, x - s.cx, y - s.cy, limits);
+#endif
                 const V t = load(&T[b * LANES]), alpha = min(h.alpha, limits.alpha_max);
                 const V after = fnma(alpha, t, t);
                 const M open = after >= limits.transmittance_min;
                 store(&T[b * LANES], keep(open, after));  // stopped pixels stay at 0
-                total = total + keep(counts(h, limits, cutoff2, target, b) & open, difference(s, target, b));
+                total = total + keep(counts(h, limits, cutoff2, target, b) & (Occlusion ? open : V(0) <= V(0)),
+                                     difference(s, target, b));
             }
             f.saved[e] = sum(total);
         }
@@ -130,5 +142,16 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
     }
     return true;
 }
+
+}  // namespace
+
+bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
+    return listed_errors<true>(f, image, mask, errors);
+}
+#if GS2D_RAYS
+bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
+    return listed_errors<false>(f, image, mask, errors);
+}
+#endif
 
 }  // namespace gs2d

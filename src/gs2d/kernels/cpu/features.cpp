@@ -29,7 +29,7 @@ void blend_tile(const Frame& f, int64_t tile, const Features& features, real* pl
     constexpr int AHEAD = 8;  // prefetch distance for the scattered records
     const int64_t count = features.count;
     const TileArea area = tile_area(f, tile);
-    const Centres centres(area);
+    const Centres centres(f, area);
     alignas(64) real T[PIXELS];
     for (int b = 0; b < BLOCKS; ++b)
         store(&T[b * LANES], keep(lanes_inside(block_x(b), block_y(b), area.width, area.height), V(1)));
@@ -48,7 +48,7 @@ void blend_tile(const Frame& f, int64_t tile, const Features& features, real* pl
         pairs.add(*entry, features);
         for (int p = first; p < pairs.pairs; ++p) {
             const int b = pairs.block[p];
-            const Hit<V> hit = hit_at(splat, zc, plane.at(b), entry->plain(), centres, b, limits);
+            const Hit<V> hit = hit_at(splat, zc, plane.at(b, centres), entry->plain(), centres, b, limits);
             V pixel_T = load(&T[b * LANES]);
             store(pairs.of_pair[p], pass_weight(hit, limits, pixel_T));
             store(&T[b * LANES], pixel_T);

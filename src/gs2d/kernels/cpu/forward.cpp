@@ -96,7 +96,7 @@ inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, 
 #pragma GCC unroll UNROLL
     for (int i = 0; i < count; ++i) {
         const Candidate& c = w.at(list[i]);
-        const Hit<V> h = meet_plane(c.planes.at(b));
+        const Hit<V> h = meet_plane(c.planes.at(b, centres));
         store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
         store(batch.log2_alpha[i], log2_alpha_of(c.planes.log2_opacity(b), h.rho));
         others |= uint32_t(c.filtered) << i;
@@ -104,8 +104,7 @@ inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, 
     for (; others; others &= others - 1) {
         const int i = __builtin_ctz(others);
         const Candidate& c = w.at(list[i]);
-        const V iz = V(c.record[8]), dx = centres.at_x(b) - V(c.record[0]), dy = centres.at_y(b) - V(c.record[1]);
-        const Hit<V> h = meet(c.planes.at(b), iz, reciprocal(iz), dx, dy, limits);
+        const Hit<V> h = meet_at(c.record, c.planes.at(b, centres), centres, b, limits);
         store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
         store(batch.log2_alpha[i], log2_alpha_of(c.planes.log2_opacity(b), h, limits));
     }
@@ -129,12 +128,11 @@ void blend_block(TileWork& w, int b, int n, const Centres& centres, const BlendL
 }
 
 // Collects the chunk entries that reach a live block, with their records in consecutive memory.
-int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const TileArea& area, const Centres& centres) {
+int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const TileBounds& bounds, const Centres& centres) {
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
     int m = 0;
     constexpr int AHEAD = 16;  // prefetch distance for the scattered data of splats
-    const V x0 = V(real(area.x0)), y0 = V(real(area.y0));
     for (int i = 0; i < n; i += LANES) {
         uint32_t splats[LANES], touched[LANES];
         for (int j = 0; j < LANES; ++j) {
@@ -145,8 +143,8 @@ int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const TileA
             }
         }
         const Footprints footprints(f, splats);
-        blocks_touched(f, footprints, x0, y0, touched);
-        const uint32_t plain = bits(plain_over_tile(f, footprints, x0, y0));
+        blocks_touched(f, footprints, bounds, touched);
+        const uint32_t plain = bits(plain_over_tile(f, footprints, bounds));
         for (int j = 0; j < LANES && i + j < n; ++j) {
             const uint32_t blocks = touched[j] & wanted;
             w.splats[m] = splats[j];
@@ -210,14 +208,15 @@ RowLines images_written(const Frame& f, const Images& out) {
 void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlendLimits<V>& limits) {
     TileWork w;
     const TileArea area = tile_area(f, tile);
-    const Centres centres(area);
+    const Centres centres(f, area);
+    const TileBounds bounds(centres, area);
     start(w.state, area);
     RowsAhead rows(f, written, tile, BLOCKS);
     Entry* const begin = &f.entries[f.tile_begin[tile]];
     Entry* const end = &f.entries[f.tile_begin[tile + 1]];
     Entry* kept = begin;
     for (Entry* e = begin; e < end; e += CHUNK) {
-        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, area, centres);
+        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, bounds, centres);
         bool live = false;
         for (int b = 0; b < BLOCKS; ++b) {
             rows.ask();

@@ -54,6 +54,7 @@ struct View {
     // exact_masks = 0 disables culling inside tiles, including splats without an ellipse (tests)
     int32_t width, height, sh_degree, exact_masks;
     int32_t near_plane_policy;  // rule 19: NEAR_PLANE_*
+    const void* rays;           // rule 25: [H, W, 4] reals, or null for a pinhole camera
 };
 
 struct Parameters {
@@ -93,12 +94,29 @@ inline bool wants_geometry(const ParameterGradients& g) {
     return g.means || g.quats || g.log_scales || g.opacity_logits || g.probe;
 }
 
+#if GS2D_RAYS
+constexpr int GRADIENT = (RECORD_FIELDS + LANES - 1) / LANES * LANES, RECORD = GRADIENT;  // in whole vectors
+
+struct CullRecord {
+    real chord, disc, k, plain_from;  // see RayReach
+    real x, y, z, unused;             // direction of the splat's centre
+};
+
+// The tiles that a splat may reach: a mask for each area (ray_bounds.h). Only the first areas are kept.
+struct RayTiles {
+    static constexpr int KEPT = 2;
+    uint64_t tiles[KEPT];
+    int32_t area[KEPT];
+    int32_t areas;
+};
+#else
 // Box tests per (tile, splat) in pixels; see Footprint.
 struct CullRecord {
     real ex, ey, slope, half;
     // disc2 < 0: the splat has an outline instead of an ellipse, and ex is its k; plain_from: see is_plain
     real inv_y2, y_right, disc2, plain_from;
 };
+#endif
 
 using TileRect = TileRectangle;
 
@@ -176,6 +194,11 @@ struct Frame {
     DepthItem* order = nullptr;         // [visible], sorted by depth; projection stores the keys of all splats
     TileRect* ordered_rects = nullptr;  // [visible], like order
     Buffer<uint32_t> histogram;         // [chunks, tiles]
+#if GS2D_RAYS
+    Buffer<char> areas;  // bounds (ray_bounds.h)
+    int64_t area_count = 0;
+    Buffer<RayTiles> ray_tiles;  // [N]
+#endif
 
     // Backward pass.
     Buffer<int64_t> slot_begin;    // [tiles + 1]
@@ -202,8 +225,23 @@ inline BlendLimits<V> limits_of(const View& v) {
 }
 
 inline Record<V> broadcast(const real* r) {
+#if GS2D_RAYS
+    return {{V(r[0]), V(r[1]), V(r[2])},
+            {V(r[3]), V(r[4]), V(r[5])},
+            {V(r[6]), V(r[7]), V(r[8])},
+            V(r[9]),
+            V(r[10]),
+            V(r[11]),
+            V(r[12]),
+            V(r[13]),
+            V(r[14]),
+            V(r[15]),
+            {V(r[16]), V(r[17]), V(r[18])},
+            V(r[19])};
+#else
     return {V(r[0]), V(r[1]), V(r[2]),  V(r[3]),  V(r[4]),  V(r[5]),  V(r[6]),  V(r[7]),
             V(r[8]), V(r[9]), V(r[10]), V(r[11]), V(r[12]), V(r[13]), V(r[14]), V(r[15])};
+#endif
 }
 
 // Pixel centres of a block whose first pixel is (x, y).

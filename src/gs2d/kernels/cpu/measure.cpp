@@ -8,9 +8,11 @@
 #include "cpu/stages.h"
 #include "cpu/threads.h"
 
-namespace gs2d {
-
+namespace gs2d_shared {
 __thread int64_t stage_ns[STAGES];
+}
+
+namespace gs2d {
 
 namespace {
 
@@ -24,7 +26,7 @@ PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits
     const TileArea area = tile_area(f, tile);
     for (int b = 0; b < BLOCKS; ++b)
         store(T[b], keep(lanes_inside(block_x(b), block_y(b), area.width, area.height), V(1)));
-    const Centres centres(area);
+    const Centres centres(f, area);
     PairCounts counts = {0, 0};
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     for (int32_t i = 0; i < f.tile_count[tile]; ++i, ++entry) {
@@ -35,7 +37,7 @@ PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits
         planes.set(record, centres);
         for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks);
-            const Hit<V> h = hit_at(s, zc, planes.at(b), entry->plain(), centres, b, limits);
+            const Hit<V> h = hit_at(s, zc, planes.at(b, centres), entry->plain(), centres, b, limits);
             const V before = load(T[b]), after = fnma(min(h.alpha, limits.alpha_max), before, before);
             counts.visible += __builtin_popcount(bits((h.alpha > V(0)) & (before > V(0))));
             counts.lanes += LANES;

@@ -1,6 +1,10 @@
 // Projection of all splats: records, cull records, tile rectangles, radii.
-#include "core/mip_filter.h"
 #include "cpu/frame.h"
+#if GS2D_RAYS
+#include "cpu/ray_bounds.h"
+#else
+#include "core/mip_filter.h"
+#endif
 #include "cpu/splat_group.h"
 #include "cpu/threads.h"
 
@@ -20,12 +24,16 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     g.parameters = load_parameters(s, i, lanes);
     g.frame = frame_of(g.parameters, f.camera);
     g.record = project(g.parameters, g.frame, f.camera);
+#if GS2D_RAYS
+    g.alive = in_range(g.parameters, g.frame) & (g.record.iz * V(real(f.view.near)) < V(1)) & first(lanes);
+#else
     g.alive = in_range(g.parameters, g.frame) & (g.frame.p.z > V(real(f.view.near))) & first(lanes);
     if (f.view.mip_px > 0) {
         const MipFilter<V> filter = mip_filter(g.record, V(real(f.view.mip_px)));
         widen(filter, g.frame, g.record);
         g.alive = g.alive & filter.in_range();
     }
+#endif
     if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
     return g;
 }
@@ -44,6 +52,39 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     g.record.blue = clamped_color(c.z, degree);
 }
 
+#if GS2D_RAYS
+// Stores the records, cull records and depths of a group, and finds which of its `alive` splats reach a tile.
+void place_group(Frame& f, const Group& g, int64_t i, int lanes, uint32_t alive, V k2, real* radii) {
+    const Record<V>& r = g.record;
+    const V zero = V(0);
+    V fields[RECORD] = {r.row0.x,      r.row0.y,      r.row0.z, r.row1.x, r.row1.y, r.row1.z, r.row2.x,
+                        r.row2.y,      r.row2.z,      r.log2_opacity,     r.red,    r.green,  r.blue,
+                        r.nx,          r.ny,          r.nz,     r.direction.x,      r.direction.y,
+                        r.direction.z, r.iz};
+    for (int k = RECORD_FIELDS; k < RECORD; ++k) fields[k] = zero;
+    store_rows<RECORD>(&f.records[i * RECORD], RECORD, lanes, fields);
+    const RayReach<V> reach = ray_reach(g.frame, r, k2, V(real(f.view.lowpass_px)));
+    const V cull[8] = {reach.chord,   reach.disc,    reach.k,       reach.plain_from,
+                       r.direction.x, r.direction.y, r.direction.z, zero};
+    store_rows<8>(reinterpret_cast<real*>(&f.cull[i]), 8, lanes, cull);
+    alignas(64) real depth[LANES], radius[LANES];
+    store(depth, V(1) / r.iz);
+    const real longer = real(f.view.width > f.view.height ? f.view.width : f.view.height);
+    const V focal = V(real(sqrt(f.view.fx * f.view.fy))), disc = V(real(f.view.lowpass_px)) * sqrt(k2);
+    const V exact = exact_chord(g.frame, r, k2);
+    store(radius, min(max(focal * exact, disc), V(longer / 2)));
+    const RayBounds<1>& all = bound_of_view(f);
+    const V away2 = distance2(V(all.x[0]), V(all.y[0]), V(all.z[0]), r.direction);
+    const V far = V(all.chord[0]) + max(exact, disc * V(all.side[0]));
+    const uint32_t near = bits((away2 <= far * far) & (far >= zero));
+    for (int l = 0; l < lanes; ++l) {
+        memcpy(&f.order[i + l].key, &depth[l], sizeof(real));
+        if (!(alive >> l & 1)) continue;
+        if (find_ray_tiles(f, i + l)) f.rects[i + l] = {0, 0, 1, 1};  // visible
+        if (radii && near >> l & 1) radii[i + l] = radius[l];
+    }
+}
+#else
 // Computes the rectangles and radii of the splats in the bit mask `boxed` of a group: rule 19, "box".
 void box_group(Frame& f, const Group& g, int64_t i, uint32_t boxed, V k2, real* radii) {
     const Square<V> s = official_square(g.frame, g.record, k2, real(f.view.lowpass_px), f.camera);
@@ -76,6 +117,7 @@ TileRect outlined_rectangle(const Frame& f, int64_t splat) {
     }
     return rect;
 }
+#endif
 
 }  // namespace
 
@@ -86,6 +128,9 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
     f.cull = reinterpret_cast<CullRecord*>(f.scratch.data);
     f.rects = reinterpret_cast<TileRect*>(f.cull + n);
     f.order = reinterpret_cast<DepthItem*>(f.rects + n);
+#if GS2D_RAYS
+    if (!bound_rays(f) || !f.ray_tiles.reserve(n)) return false;
+#endif
     const bool blending = reach == Reach::BLEND;
     const V error_k2 = V(real(f.view.error_cutoff * f.view.error_cutoff)),
             log2_alpha_min = V(real(log2(f.view.alpha_min)));
@@ -94,8 +139,10 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
             if (i + 2 * LANES <= n) ask_for(s.shN + (i + LANES) * 3 * s.sh_rest, LANES * 3 * s.sh_rest);
             Group g = project_group(f, s, i, lanes, blending);
+#if !GS2D_RAYS
             const M reaches = reaches_camera_plane(g.frame, error_k2);
             if (f.view.near_plane_policy == NEAR_PLANE_CULL) g.alive = g.alive & invert(reaches);
+#endif
             if (any(g.alive)) color_group(f, s, i, lanes, g);
             const uint32_t alive = bits(g.alive);
             for (int l = 0; l < lanes; ++l) f.rects[i + l] = {0, 0, 0, 0};
@@ -105,6 +152,9 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const Record<V>& r = g.record;
             const V blend_k2 = V(real(2 * LN2)) * (r.log2_opacity - log2_alpha_min);
             const V k2 = blending ? max(blend_k2, V(0)) : reach == Reach::ERRORS ? error_k2 : max(blend_k2, error_k2);
+#if GS2D_RAYS
+            place_group(f, g, i, lanes, alive, k2, radii);
+#else
             const Footprint<V> o = footprint(g.frame, r, k2, real(f.view.lowpass_px), f.camera);
             const V fields[RECORD] = {r.cx, r.cy,           r.au,  r.bu,    r.av,   r.bv, r.ai, r.bi,
                                       r.iz, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
@@ -134,6 +184,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
                                                            f.tiles_x, f.tiles_y);
                 if (radii) radii[i + l] = clipped_radius(o_l, crosses >> l & 1, f.view.width, f.view.height);
             }
+#endif
         }
     });
     return true;
@@ -176,13 +227,21 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
                 zero_rows(intrinsics, i, 4, lanes);
             continue;
         }
+#if GS2D_RAYS
+        RecordGradient<V> gr = {{g[0], g[1], g[2]}, {g[3], g[4], g[5]}, {g[6], g[7], g[8]},    g[9],  g[10], g[11], g[12],
+                                g[13],              g[14],              g[15], {g[16], g[17], g[18]}, g[19], e[2],  e[3]};
+        gr.abs_x = gr.abs_x * V(real(1 / f.view.fx)), gr.abs_y = gr.abs_y * V(real(1 / f.view.fy));
+#else
         RecordGradient<V> gr = {g[0],  g[1],  g[2],  g[3],  g[4],  g[5],  g[6], g[7], g[8], g[9],
                                 g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
+#endif
         const SplatParameters<V> p = load_parameters(s, i, lanes);
         const Frame3<V> frame = frame_of(p, f.camera);
         const Record<V> r = project(p, frame, f.camera);
+#if !GS2D_RAYS
         const bool filters = f.view.mip_px > 0;
         const Probe<V> filtered = filters ? widen_vjp(r, V(real(f.view.mip_px)), gr) : Probe<V>{};
+#endif
 
         V sh[3 * SH_MAX], basis[SH_MAX], along[SH_MAX];
         const int degree = f.view.sh_degree;
@@ -201,7 +260,9 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
 
         ParameterGradient<V> d =
             project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
+#if !GS2D_RAYS
         if (filters) d.probe_x = filtered.x, d.probe_y = filtered.y;
+#endif
         const auto write = [&]<int K>(real* to, V(&values)[K]) {
             if (!to) return;
             for (V& v : values) v = keep(seen, v);
@@ -218,10 +279,12 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
             write(out.probe, probe);
         else
             write(out.probe, probe2);
+#if !GS2D_RAYS
         if (!intrinsics) continue;
         const IntrinsicsGradient<V> of_intrinsics = intrinsics_vjp(frame, r, gr, f.camera);
         V values_of_intrinsics[] = {of_intrinsics.fx, of_intrinsics.fy, of_intrinsics.cx, of_intrinsics.cy};
         write(intrinsics, values_of_intrinsics);
+#endif
     }
 }
 

@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <time.h>
 
-namespace gs2d {
+namespace gs2d_shared {  // by the rasterizers of both kinds of cameras
 
 enum Stage { PROJECT, SORT, BIN, BLEND_FORWARD, INDEX_SLOTS, BLEND_BACKWARD, PROJECT_BACKWARD, STAGES };
 
@@ -25,4 +25,7 @@ class StageClock {
     timespec last_;
 };
 
-}  // namespace gs2d
+}  // namespace gs2d_shared
+namespace gs2d {
+using namespace gs2d_shared;
+}

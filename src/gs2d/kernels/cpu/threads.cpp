@@ -7,7 +7,7 @@
 
 #include "cpu/export.h"
 
-namespace gs2d {
+namespace gs2d_shared {
 namespace {
 
 constexpr int MAX_THREADS = 256;
@@ -150,7 +150,7 @@ void run_tasks(int64_t n, Task task, void* context) {
     pthread_mutex_unlock(&pool.run_lock);
 }
 
-}  // namespace gs2d
+}  // namespace gs2d_shared
 
 GS2D_EXPORT void gs2d_set_threads(int n) { gs2d::set_threads(n); }
 GS2D_EXPORT int gs2d_get_threads() { return gs2d::get_threads(); }

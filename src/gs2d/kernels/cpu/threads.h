@@ -8,7 +8,7 @@
 #include <atomic>
 #include <cstdint>
 
-namespace gs2d {
+namespace gs2d_shared {  // by the rasterizers of both kinds of cameras
 
 void set_threads(int n);  // at least 1; the calling thread is one of them
 int get_threads();
@@ -47,4 +47,7 @@ template <class F> void share_out(int64_t first, int64_t end, std::atomic<uint8_
     }
 }
 
-}  // namespace gs2d
+}  // namespace gs2d_shared
+namespace gs2d {
+using namespace gs2d_shared;
+}

@@ -99,7 +99,7 @@ struct RowLines {
     struct Line {
         const real* at;
         int channels;
-    } lines[64];
+    } lines[80];  // of all images and their gradients, in double
     int count = 0, width;
     explicit RowLines(const View& view) : width(view.width) {}
     void add(const real* image, int channels) {
@@ -136,6 +136,7 @@ class RowsAhead {
     int left_ = 0, at_ = 0, each_ = 0;
 };
 
+#if !GS2D_RAYS  // else cpu/ray_bounds.h has its own
 // Inputs of the footprint test of LANES splats against a tile, and which splats are unbounded.
 struct Footprints {
     V ex, ey, slope, half, inv_y2, y_right, disc2, plain_from;  // from the cull record
@@ -202,5 +203,6 @@ inline void blocks_touched(const Frame& f, const Footprints& s, V tile_x, V tile
     if (!f.view.exact_masks)
         for (int i = 0; i < LANES; ++i) masks[i] = ALL_BLOCKS;
 }
+#endif
 
 }  // namespace gs2d

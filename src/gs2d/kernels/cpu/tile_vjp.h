@@ -53,7 +53,7 @@ __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t 
     planes.set(record, centres);
     for (; blocks; blocks &= blocks - 1) {
         const int b = __builtin_ctz(blocks);
-        const Hit<V> h = hit_at(splat, zc, planes.at(b), plain, centres, b, limits);
+        const Hit<V> h = hit_at(splat, zc, planes.at(b, centres), plain, centres, b, limits);
         V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
         weigh_vjp<Geo, Dist, false>(splat, h.depth, h.inverse_depth, h.alpha, limits, load_gradient(s, b), pixel_T, pixel_S);
         store(&s[T][b * LANES], pixel_T);
@@ -107,7 +107,7 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
         store(w.depth[i], h.depth), store(w.rho[i], h.rho);
         if constexpr (WithInverse) store(w.inverse_depth[i], h.inverse_depth);
     };
-    for (int i = 0; i < w.pairs; ++i) put(i, meet_plane(w.planes[w.splat[i]].at(w.block[i])));
+    for (int i = 0; i < w.pairs; ++i) put(i, meet_plane(w.planes[w.splat[i]].at(w.block[i], centres)));
     for (int i = 0; i < w.pairs; ++i)
         store(w.alpha[i], plain_alpha_of(V(w.record[w.splat[i]][9]), load(w.rho[i]), limits));
     for (uint32_t left = w.others; left; left &= left - 1) {
@@ -116,7 +116,7 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
         const V zc = reciprocal(s.iz);
         M filtered = V(1) < V(0);
         for (int i = j ? w.end[j - 1] : 0; i < w.end[j]; ++i) {
-            const Hit<V> h = hit_at(s, zc, w.planes[j].at(w.block[i]), false, centres, w.block[i], limits);
+            const Hit<V> h = hit_at(s, zc, w.planes[j].at(w.block[i], centres), false, centres, w.block[i], limits);
             put(i, h);
             store(w.alpha[i], h.alpha);
             w.ray[i] = h.ray;
@@ -149,17 +149,27 @@ inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>
     const auto pair = [&](int i) -> PairGradient<V> {
         return {Colors ? load(w.w[i]) : V(0), load(w.alpha[i]), Geo ? load(w.I[i]) : V(0)};
     };
+#if GS2D_RAYS
+    const Perpendicular<V> e = perpendicular(splat.direction);
+    const Vec3<V> unit_x = {dot(splat.row0, e.first), dot(splat.row1, e.first), dot(splat.row2, e.first)},
+                  unit_y = {dot(splat.row0, e.second), dot(splat.row1, e.second), dot(splat.row2, e.second)};
+#endif
     const auto geometry = [&](int i) {
         const int b = w.block[i];
         const PairGradient<V> p = pair(i);
-        const PlaneAt<V> plane = w.planes[j].at(b);  // recomputed, which is cheaper than storing u and v
+        const PlaneAt<V> plane = w.planes[j].at(b, centres);  // recomputed, which is cheaper than storing u and v
         const V depth = load(w.depth[i]), t = p.ln_alpha * depth, tz = t * depth;
         V tu = tz * plane.X, tv = tz * plane.Y;
         M ray;
         if constexpr (Filtered) ray = w.ray[i], tu = keep(ray, tu), tv = keep(ray, tv);
+#if GS2D_RAYS
+        add_geometry<Geo, Abs, Filtered>(centres.from(splat.direction, b), unit_x, unit_y, t, tu, tv, load(w.rho[i]),
+                                         Abs ? load(w.inverse_depth[i]) : V(0), ray, p, sums);
+#else
         add_geometry<Geo, Abs, Filtered, false>(splat, centres.at_x(b) - splat.cx, centres.at_y(b) - splat.cy, t, tu,
                                                 tv, load(w.rho[i]), Abs ? load(w.inverse_depth[i]) : V(0), ray, p,
                                                 sums);
+#endif
     };
     for (int i = first; i < end; ++i) geometry(i);
     if constexpr (Colors)
@@ -170,6 +180,19 @@ template <bool Abs>
 inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool filtered, const Slots& to,
                        const BlendLimits<V>& limits) {
     RecordGradient<V> g = finish(splat, Abs ? reciprocal(splat.iz) : V(0), sums, limits);
+#if GS2D_RAYS
+    (void)filtered;
+    const V zero = V(0);
+    const V rows[16] = {g.row0.x, g.row0.y,     g.row0.z, g.row1.x, g.row1.y, g.row1.z, g.row2.x, g.row2.y,
+                        g.row2.z, g.ln_opacity, g.red,    g.green,  g.blue,   g.nx,     g.ny,     g.nz};
+    const V others[4] = {g.direction.x, g.direction.y, g.direction.z, g.iz}, extra[4] = {zero, zero, g.abs_x, g.abs_y};
+    transpose_reduce<16>(rows, to.gradients);
+    transpose_reduce<4>(others, to.gradients + 16);
+    for (int k = RECORD_FIELDS; k < GRADIENT; ++k) to.gradients[k] = 0;
+    if (!to.extras) return;
+    *to.has_extra = Abs;
+    if (Abs) transpose_reduce<GRADIENT_EXTRA>(extra, to.extras);
+#else
     if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // not needed separately
     const V fields[16] = {g.cx, g.cy,         g.au,  g.bu,    g.av,   g.bv, g.ai, g.bi,
                           g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
@@ -178,6 +201,7 @@ inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool fil
     *to.has_extra = Abs || filtered;
     const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
     if (Abs || filtered) transpose_reduce<GRADIENT_EXTRA>(extra, to.extras);
+#endif
 }
 
 // Empties the batch; returns the slot of the next splat.
@@ -200,7 +224,11 @@ __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const
         }
     for (int j = 0, first = 0; j < w.splats; first = w.end[j++], to = to.from(1)) {
         const V zero = V(0);
-        PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
+        PairSums<V> sums = {
+#if GS2D_RAYS
+                            zero,
+#endif
+                            zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
                             zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
         const Record<V> splat = broadcast(w.record[j]);
         if constexpr (!WEIGHTS_FIRST) {  // both read the same pixels
@@ -223,7 +251,7 @@ __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const
 template <bool Geo, bool Dist, bool Abs, bool Trans = false, bool Feat = false>
 void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
               const BlendLimits<V>& limits, RowsAhead next, TileFeatures features) {
-    const Centres centres(area);
+    const Centres centres(f, area);
     Batch batch;
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];

@@ -26,7 +26,7 @@ bool gather(const Frame& f, int64_t tile, const TileArea& area, const BlendLimit
     pairs.begin[BLOCKS] = total;
     if (!pairs.values.reserve(2 * LANES * size_t(total))) return false;
 
-    const Centres centres(area);
+    const Centres centres(f, area);
     alignas(64) real T[BLOCKS][LANES];
     for (int b = 0; b < BLOCKS; ++b)
         store(T[b], keep(lanes_inside(block_x(b), block_y(b), area.width, area.height), V(1)));
@@ -38,7 +38,7 @@ bool gather(const Frame& f, int64_t tile, const TileArea& area, const BlendLimit
         planes.set(record, centres);
         for (uint32_t left = entries[i].blocks; left; left &= left - 1) {
             const int b = __builtin_ctz(left);
-            const Hit<V> h = hit_at(splat, zc, planes.at(b), entries[i].plain(), centres, b, limits);
+            const Hit<V> h = hit_at(splat, zc, planes.at(b, centres), entries[i].plain(), centres, b, limits);
             const V alpha = min(h.alpha, limits.alpha_max), before = load(T[b]), after = fnma(alpha, before, before);
             const M goes_on = after >= limits.transmittance_min;
             store(T[b], keep(goes_on, after));
