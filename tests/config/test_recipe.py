@@ -49,15 +49,6 @@ def test_rates_at_the_end_are_constant() -> None:
     assert settling.sh0 == pytest.approx(0.1 * LearningRates().sh0)
 
 
-def test_rates_over_again_repeat_the_decay() -> None:
-    rates = LearningRates(means_decay_steps=100, settle_start=60, settle_steps=40, settle_factor=0.1)
-    again = rates.over_again(80, 100, 50)
-    for step in (0, 5, 20):
-        assert again.means_at(round(2.5 * step)) == pytest.approx(rates.means_at(80 + step), rel=0.03)
-    for now, before in ((0, 80), (25, 90), (50, 100)):
-        assert again.quats * again.settled_at(now) == pytest.approx(rates.quats * rates.settled_at(before))
-
-
 def test_official_densification_runs_at_600_to_14900_every_100() -> None:
     iterations = [i for i in range(1, 30_001) if GradDensify().densifies(i)]
     assert iterations == list(range(600, 15_000, 100))

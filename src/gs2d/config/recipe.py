@@ -143,19 +143,6 @@ class LearningRates:
         settled = self.times(self.settled_at(iterations))
         return replace(settled, means=means, means_final=means, settle_start=0, settle_steps=0, settle_factor=0.0)
 
-    def over_again(self, start: int, stop: int, iterations: int) -> LearningRates:
-        """Return rates that decay within ``iterations`` as these do between two iterations."""
-        before, after = self.settled_at(start), self.settled_at(stop)
-        return replace(
-            self.times(before),
-            means=self.means_at(start),
-            means_final=self.means_at(stop),
-            means_decay_steps=iterations,
-            settle_start=0,
-            settle_steps=iterations if after != before else 0,
-            settle_factor=after / before if after != before else 0.0,
-        )
-
 
 @dataclass(frozen=True)
 class GradDensify:

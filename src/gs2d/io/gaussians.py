@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from gs2d.core.sh import MAX_DEGREE, harmonics, num_coefficients
+from gs2d.core.sh import MAX_DEGREE, num_coefficients
 from gs2d.core.splats import Splats
-from gs2d.core.transforms import transform_splats
 from gs2d.errors import DataError
 
 Warn = Callable[[str], object]
@@ -22,7 +21,6 @@ FLAT_LOG_SCALE = math.log(1e-6)  # world units; largest thickness of a disk in f
 NO_SCALE = -80.0  # log scale that represents a scale of 0
 _SHARE = 0.01  # largest ratio of the thickness of a disk to its smaller scale
 THIN = 0.25  # largest ratio of the third scale to the larger of the others for disks, which quantization may thicken
-_OBLIQUE = (0.36, 0.48, 0.8)  # a direction in which no harmonic is 0
 _FLAT = 0.99  # fraction of the Gaussians that must be disks
 
 
@@ -63,44 +61,6 @@ class Gaussians:
             if field.name != "shN"
         }
         return cls(**others, shN=np.concatenate(padded))
-
-    def placed(self, matrix: np.ndarray) -> Gaussians:
-        """Apply a similarity transform [4, 4]: rotation, translation, uniform scale.
-
-        Raises ValueError if it is no similarity.
-        """
-        linear = matrix[:3, :3]
-        with np.errstate(over="ignore", invalid="ignore"):
-            scale = float(np.cbrt(np.linalg.det(linear)))
-            rotation = linear / scale if scale > 0 else linear
-            turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-        if not (turns and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)):
-            raise ValueError("expected a rotation, a translation and a uniform scale")
-        moved = Gaussians.of(transform_splats(self.disks(), scale, rotation, matrix[:3, 3]))
-        thickness = (self.log_scales[:, 2:].astype(np.float64) + math.log(scale)).astype(np.float32)
-        return replace(moved, log_scales=np.concatenate([moved.log_scales[:, :2], thickness], axis=1))
-
-    def half_turned_about_z(self) -> Gaussians:
-        """Rotate by 180 degrees about z; exact, only signs and the order of components change."""
-        w, x, y, z = self.quats.T
-        return replace(self.mirrored((-1, -1, 1)), quats=np.stack([-z, -y, x, w], axis=1))
-
-    def mirrored(self, signs: tuple[int, int, int]) -> Gaussians:
-        """Mirror axes, with one sign (1 or -1) per axis; exact, only signs change.
-
-        A rotation R becomes S R S with S = diag(signs), which is a rotation with the mirrored covariance.
-        """
-        x, y, z = signs
-        a, b, c = _OBLIQUE
-        at = np.array(harmonics(a, b, c, self.sh_degree))
-        there = np.array(harmonics(x * a, y * b, z * c, self.sh_degree))
-        with np.errstate(invalid="ignore"):  # signalling NaN; values are checked later
-            return replace(
-                self,
-                means=self.means * np.array(signs, np.float32),
-                quats=self.quats * np.array([1, y * z, x * z, x * y], np.float32),
-                shN=self.shN * np.sign(at * there).astype(np.float32).reshape(-1, 1),
-            )
 
     def rows(self, index: np.ndarray) -> Gaussians:
         """Return the Gaussians of an index array or a mask."""

@@ -18,6 +18,7 @@ from PIL import Image
 
 from gs2d.contrib.formats.sog import packed_sog
 from gs2d.contrib.formats.spz import read_spz, write_spz
+from gs2d.contrib.formats.turned import mirrored
 from gs2d.core.sh import sh_basis
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
@@ -72,7 +73,7 @@ def test_spz_records_select_the_coordinate_system(tmp_path: Path, system: int, v
         pytest.importorskip("zstandard")
     path = tmp_path / "a.spz"
     write_spz(path, Gaussians.of(a_scene(40, 3)), version=version)
-    numbers = read_spz(path)[0].mirrored((1, -1, -1))  # as they are stored
+    numbers = mirrored(read_spz(path)[0], (1, -1, -1))  # as they are stored
     other = struct.pack("<II", 0xADBE0002, 3) + b"abc"
     record = struct.pack("<III", 0xADBE0003, 4, system)
     back = read_spz(with_records(path, version, other + record))[0]

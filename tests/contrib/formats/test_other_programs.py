@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from gs2d.contrib.formats.gltf import EXTENSION
+from gs2d.contrib.formats.turned import mirrored
 from gs2d.core.splats import Splats
 from gs2d.io.formats.splat_formats import read_splat_file, write_layout
 from gs2d.io.gaussians import Gaussians, unit_quats
@@ -145,10 +146,10 @@ def test_spz_4_is_exchanged_with_splat_transform(tmp_path: Path) -> None:
     assert theirs.kind == "SPZ version 4"
     # It stores coordinates as they are, where the format has y up: half a turn about x.
     bits = {"means": 3e-4, "scales": 0.04, "quats": 0.3, "sh0": 0.015}
-    near(theirs.gaussians.mirrored((1, -1, -1)), splats, **bits, shN=0.1)
+    near(mirrored(theirs.gaussians, (1, -1, -1)), splats, **bits, shN=0.1)
     write_layout(tmp_path / "ours.spz", splats, "spz4")
     splat_transform(tmp_path / "ours.spz", tmp_path / "back.ply")
-    near(read_splat_file(tmp_path / "back.ply").gaussians.mirrored((1, -1, -1)), splats, **bits, shN=0.05)
+    near(mirrored(read_splat_file(tmp_path / "back.ply").gaussians, (1, -1, -1)), splats, **bits, shN=0.05)
 
 
 @pytest.fixture

@@ -9,9 +9,10 @@ import pytest
 
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import LearningRates
 from gs2d.contrib.lab import settle as module
 from gs2d.contrib.lab.partition import Partition
-from gs2d.contrib.lab.settle import capture_digest, fitting_partition
+from gs2d.contrib.lab.settle import capture_digest, fitting_partition, over_again
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.estimate import Estimate, Range
 from gs2d.pipeline.prepare.loaded import loaded_run
@@ -63,3 +64,12 @@ def test_a_capture_is_known_by_its_cameras_points_and_split() -> None:
     assert capture_digest(replace(SCENE, train=SCENE.train[1:], test=SCENE.train[:1])) != one
     assert SCENE.points is not None
     assert capture_digest(replace(SCENE, points=None)) != one
+
+
+def test_rates_over_again_repeat_the_decay() -> None:
+    rates = LearningRates(means_decay_steps=100, settle_start=60, settle_steps=40, settle_factor=0.1)
+    again = over_again(rates, 80, 100, 50)
+    for step in (0, 5, 20):
+        assert again.means_at(round(2.5 * step)) == pytest.approx(rates.means_at(80 + step), rel=0.03)
+    for now, before in ((0, 80), (25, 90), (50, 100)):
+        assert again.quats * again.settled_at(now) == pytest.approx(rates.quats * rates.settled_at(before))

@@ -19,6 +19,7 @@ import numpy as np
 
 from gs2d.contrib.formats.gltf_document import GltfDocument, node_matrices, read_document
 from gs2d.contrib.formats.quantised import log_scales_of, to_byte
+from gs2d.contrib.formats.turned import half_turned_about_z, placed
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
@@ -83,7 +84,7 @@ def write_gltf(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 def _attributes(gaussians: Gaussians) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
     """Return the arrays to write, with rows aligned to 4 bytes, and the properties of their accessors."""
-    g = gaussians.half_turned_about_z()
+    g = half_turned_about_z(gaussians)
     color = np.full((len(g), 4), 65535, "<u2")  # for viewers that show points only
     color[:, :3] = LINEAR_U16[to_byte(255.0 * (0.5 + C0 * g.sh0.astype(np.float64)))]
     opacity = sigmoid(g.opacity_logits)
@@ -219,9 +220,9 @@ def _gaussians(document: GltfDocument, attributes: dict[str, int], warn: Warn) -
 def _placed(path: str | os.PathLike[str], g: Gaussians, matrix: np.ndarray) -> Gaussians:
     """Transform splats to the coordinates of PLY files; a rotation by 180 degrees is exact."""
     if np.allclose(matrix, _FROM_GLTF, rtol=0, atol=1e-6):
-        return g.half_turned_about_z()
+        return half_turned_about_z(g)
     try:
-        return g.placed(matrix)
+        return placed(g, matrix)
     except ValueError as error:
         raise DataError(f"{Path(path)}: {error} of the nodes of splats; bake it into them") from error
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.contrib.formats.quantised import logit_of_byte, to_byte
+from gs2d.contrib.formats.turned import mirrored, placed
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import required
 from gs2d.core.growth import check_growth
@@ -57,7 +58,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: in
     The step of positions is at most a 64th of the median splat size, if the farthest position leaves enough bits.
     Raises DataError if a position exceeds 2^23 units, BackendError for version 4 without zstandard.
     """
-    g = gaussians.mirrored((1, -1, -1))
+    g = mirrored(gaussians, (1, -1, -1))
     farthest = float(np.abs(g.means).max()) if len(g) else 0.0
     bits = _fractional_bits(g, farthest)
     if farthest > _LARGEST:
@@ -167,8 +168,8 @@ def _in_our_axes(g: Gaussians, system: int) -> Gaussians:
     library, which therefore differs by 180 degrees about x from the axes that LFD, RFD, LBU and RBU name.
     """
     right, up, front, turned = (system - 1 >> bit & 1 for bit in range(4))
-    g = g.mirrored((1 if right else -1, -1 if up else 1, 1 if front else -1))
-    return g.placed(_QUARTER) if turned else g
+    g = mirrored(g, (1 if right else -1, -1 if up else 1, 1 if front else -1))
+    return placed(g, _QUARTER) if turned else g
 
 
 def _system(path: str | os.PathLike[str], records: bytes) -> int:

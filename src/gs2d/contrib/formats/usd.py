@@ -23,6 +23,7 @@ import numpy as np
 
 from gs2d.contrib.formats import usd_process
 from gs2d.contrib.formats.quantised import log_scales_of
+from gs2d.contrib.formats.turned import placed
 from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.extras import install
 from gs2d.errors import BackendError, DataError
@@ -245,7 +246,7 @@ def _placed(where: str, g: Gaussians, matrix: np.ndarray) -> Gaussians:
     if np.array_equal(matrix, np.eye(4)):
         return g
     try:
-        return g.placed(matrix)
+        return placed(g, matrix)
     except ValueError as error:
         raise DataError(f"{where}: {error}; bake the transform into the splats") from error
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.config.densify import Densify
-from gs2d.config.recipe import ALL, GradDensify, Recipe, validate
+from gs2d.config.recipe import ALL, GradDensify, LearningRates, Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import to_json
 from gs2d.contrib.lab.cells import spread_of
@@ -192,12 +192,26 @@ def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Rec
         name="seams",
         train=dict.fromkeys(ALL, "all"),
         losses=tuple(replace(term, start=0) for term in stage.losses),
-        lr=block.lr.over_again(start, block.iterations, stage.iterations),
+        lr=over_again(block.lr, start, block.iterations, stage.iterations),
         densify=None,
         on_enter=(),
         sh_interval=0,
     )
     return validate(replace(_with_fixed_exposure(recipe), stages=(stage,), dense_start=None, removal=None))
+
+
+def over_again(rates: LearningRates, start: int, stop: int, iterations: int) -> LearningRates:
+    """Return rates that decay within ``iterations`` as the given ones do between two iterations."""
+    before, after = rates.settled_at(start), rates.settled_at(stop)
+    return replace(
+        rates.times(before),
+        means=rates.means_at(start),
+        means_final=rates.means_at(stop),
+        means_decay_steps=iterations,
+        settle_start=0,
+        settle_steps=iterations if after != before else 0,
+        settle_factor=after / before if after != before else 0.0,
+    )
 
 
 def _with_fixed_exposure(recipe: Recipe) -> Recipe:
