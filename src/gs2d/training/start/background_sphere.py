@@ -30,12 +30,6 @@ def sphere_points(scene: Scene, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, n
 
     Positions that no image shows in a pixel of unknown depth are omitted; a colour is the median of such pixels. There
     are none for images with an alpha channel.
-
-    Parameters
-    ----------
-    scene : Scene
-    sweep : Sweep
-        Downscaled images of the scene, and their depth maps.
     """
     sampled = range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS)))
     reach = reach_of(scene, _swept_places(sweep, sampled))

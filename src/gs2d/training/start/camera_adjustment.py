@@ -39,42 +39,21 @@ GAIN = 0.9  # adjusted cameras are used if the median error across epipolar line
 
 @dataclass(frozen=True, eq=False)
 class _Pixels:
-    """Pixels of a view that are matched.
+    """Pixels of a view that are matched."""
 
-    Attributes
-    ----------
-    at : ndarray [M, 2] int
-        Column and row.
-    rays : ndarray [M, 3]
-        Camera coordinates at depth 1.
-    inverse : ndarray [M]
-        Inverse depth; changed in place.
-    """
-
-    at: np.ndarray
-    rays: np.ndarray
-    inverse: np.ndarray
+    at: np.ndarray  # [M, 2] int; column and row
+    rays: np.ndarray  # [M, 3] camera coordinates at depth 1
+    inverse: np.ndarray  # [M] inverse depth; changed in place
 
 
 @dataclass(frozen=True, eq=False)
 class _Matches:
-    """Pixels of a view matched in another one.
-
-    Attributes
-    ----------
-    other : int
-    rows : ndarray [m] int
-        Which of the pixels.
-    places : ndarray [m, 2] px
-        Positions in the other view.
-    information : ndarray [m, 2, 2]
-        Inverse covariance of the places.
-    """
+    """Pixels of a view matched in another one."""
 
     other: int
-    rows: np.ndarray
-    places: np.ndarray
-    information: np.ndarray
+    rows: np.ndarray  # [m] int; which of the pixels
+    places: np.ndarray  # [m, 2] px; positions in the other view
+    information: np.ndarray  # [m, 2, 2] inverse covariance of the places
 
 
 def adjust_cameras(scene: Scene, settings: DenseStart) -> tuple[Scene, Sweep | None]:

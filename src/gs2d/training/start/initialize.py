@@ -22,23 +22,12 @@ RELATIVE_SCALE_FLOOR = 1e-4  # of the extent; used in small scenes, where it is 
 
 @dataclass(frozen=True, eq=False)
 class Initial:
-    """The first splats.
-
-    Attributes
-    ----------
-    splats : Splats
-    source : str
-        "points" of the scene, or "random" points.
-    dropped : int
-        Number of unusable points.
-    sized : Tensor [N] bool
-        Splats with the size of their point.
-    """
+    """The first splats."""
 
     splats: Splats
-    source: str
-    dropped: int
-    sized: Tensor
+    source: str  # "points" of the scene, or "random" points
+    dropped: int  # number of unusable points
+    sized: Tensor  # [N] bool; splats with the size of their point
 
 
 def initial_splats(
@@ -52,22 +41,9 @@ def initial_splats(
 ) -> Initial:
     """Create splats on the points of the scene, or on random points in its bounds if it has none.
 
-    Parameters
-    ----------
-    scene : Scene
-    sh_degree : int
-    random_points : int
-        Number of random points.
-    near : float, world units
-        Points that no training camera sees beyond this depth, or that are nearer to one, are dropped.
-    generator : torch.Generator
-        CPU generator of random points and rotations.
-    dtype : torch.dtype
-
-    Raises
-    ------
-    DataError, ProtocolError
-        If fewer than two points are usable.
+    Points that no training camera sees beyond the depth ``near`` (world units), or that are nearer to one, are dropped.
+    ``generator``, on the CPU, is for random points and rotations. Raises DataError or ProtocolError if fewer than two
+    points are usable.
     """
     cloud = scene.points
     if cloud is not None and len(cloud) > 0:
@@ -103,10 +79,7 @@ def initial_splats(
 def splats_as_start(splats: Splats, *, sh_degree: int, dtype: torch.dtype = torch.float32) -> Splats:
     """Return a copy of splats with an SH degree; missing coefficients are 0.
 
-    Raises
-    ------
-    DataError
-        If there are no splats, or a value is not finite.
+    Raises DataError if there are no splats, or a value is not finite.
     """
     if len(splats) == 0:
         raise DataError("expected at least one splat to start from, got none")
@@ -122,17 +95,9 @@ def splats_as_start(splats: Splats, *, sh_degree: int, dtype: torch.dtype = torc
 
 
 def usable_points(points: np.ndarray, scene: Scene, near: float) -> np.ndarray:
-    """Return which points are finite, in front of a training camera (depth > near) and not within ``near`` of one.
+    """Return which points [P, 3] are finite, in front of a training camera and not within ``near`` of one, [P] bool.
 
-    Parameters
-    ----------
-    points : ndarray [P, 3] world units
-    scene : Scene
-    near : float, world units
-
-    Returns
-    -------
-    ndarray [P] bool
+    In front: with a depth > ``near``. All are in world units.
     """
     finite = np.isfinite(points).all(axis=1)
     safe = np.where(finite[:, None], points, 0.0)

@@ -46,21 +46,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Windows:
-    """The patches that are compared.
+    """The patches that are compared."""
 
-    Attributes
-    ----------
-    radius : int, px
-        Patches have 2 radius + 1 pixels a side.
-    noise : float
-        Variance of grey values, [0, 1]^2, added to both variances of the NCC.
-    texture : float
-        Variance of a patch below which every depth fits.
-    """
-
-    radius: int
-    noise: float
-    texture: float
+    radius: int  # px; patches have 2 radius + 1 pixels a side
+    noise: float  # variance of grey values, [0, 1]^2, added to both variances of the NCC
+    texture: float  # variance of a patch below which every depth fits
 
 
 FINE_WINDOWS = Windows(3, 1e-4, 2e-5)
@@ -70,37 +60,19 @@ BARE = 127  # flatness, 0 to 255, of these
 
 @dataclass(frozen=True, eq=False)
 class SmallView:
-    """A downscaled training view.
+    """A downscaled training view; depths are in world units."""
 
-    Attributes
-    ----------
-    color : Tensor [3, H, W]
-    grey : Tensor [1, 1, H, W]
-    usable : ndarray [H, W] bool
-        Unmasked, opaque pixels.
-    K, T : ndarray [3, 3], [4, 4] float64
-        Intrinsics at this size; T_cam_world.
-    near, far : float, world units
-        Limits of the sweep; 0 if the view shows too few points.
-    middle : float, world units
-        Median depth of the sparse points that it shows; 0 as above.
-    pixels, depth : ndarray [M, 2] px, [M] world units
-        These points, if the capture lists the points of each image; empty if they are guessed.
-    nearest : float, world units
-        Nearest depth of all sparse points inside the image, matched there or not (2nd percentile).
-    """
-
-    color: Tensor
-    grey: Tensor
-    usable: np.ndarray
-    K: np.ndarray
-    T: np.ndarray
-    near: float
+    color: Tensor  # [3, H, W]
+    grey: Tensor  # [1, 1, H, W]
+    usable: np.ndarray  # [H, W] bool; unmasked, opaque pixels
+    K: np.ndarray  # [3, 3] float64; intrinsics at this size
+    T: np.ndarray  # [4, 4] float64; T_cam_world
+    near: float  # limits of the sweep; 0 if the view shows too few points
     far: float
-    middle: float
-    pixels: np.ndarray
-    depth: np.ndarray
-    nearest: float
+    middle: float  # median depth of the sparse points that it shows; 0 as above
+    pixels: np.ndarray  # [M, 2] px; these points, if the capture lists the points of each image; empty if guessed
+    depth: np.ndarray  # [M] of the same points
+    nearest: float  # depth of all sparse points inside the image, matched there or not (2nd percentile)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -110,24 +82,12 @@ class SmallView:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Result of a sweep.
+    """Result of a sweep."""
 
-    Attributes
-    ----------
-    views : sequence of SmallView
-        Training views in order. Not all are in memory.
-    neighbours : tuple of tuple of int
-        Neighbours of each view, best first; empty for views that were not swept.
-    depths : sequence of ndarray [H, W] float64 world units
-        Depth along the optical axis; 0 where unknown.
-    scores : sequence of ndarray [H, W] float32
-        NCC of these depths.
-    """
-
-    views: Sequence[SmallView]
-    neighbours: tuple[tuple[int, ...], ...]
-    depths: Sequence[np.ndarray]
-    scores: Sequence[np.ndarray]
+    views: Sequence[SmallView]  # training views in order; not all are in memory
+    neighbours: tuple[tuple[int, ...], ...]  # of each view, best first; empty for views that were not swept
+    depths: Sequence[np.ndarray]  # [H, W] float64 world units, along the optical axis; 0 where unknown
+    scores: Sequence[np.ndarray]  # [H, W] float32; NCC of these depths
 
     def consistent(self, index: int) -> np.ndarray:
         """Return the pixels on whose depth enough neighbours agree, bool [H, W]."""
@@ -149,15 +109,7 @@ class Sweep:
 def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     """Compute depth maps of the training views of a scene.
 
-    Parameters
-    ----------
-    scene : Scene
-    settings : DenseStart
-
-    Raises
-    ------
-    DataError
-        If the capture has neither sparse points nor bounds that two images show.
+    Raises DataError if the capture has neither sparse points nor bounds that two images show.
     """
     depth_range, factor = sweep_range(scene), sweep_downscale(scene, settings)
     limit = 0 if scene.ahead else cache_bytes(SWEEP_BYTES)

@@ -27,16 +27,8 @@ def fit_start(splats: Splats, sweep: Sweep, sparse: Tensor | None = None) -> Spl
     """Return the splats with colour, opacity and size fitted to the views of a sweep (formulas: docs/math.md).
 
     A view shows a splat if its swept depth is that of the splat, to ``AGREE``. Splats that no view shows keep their
-    colour.
-
-    Parameters
-    ----------
-    splats : Splats
-        Result of :func:`gs2d.training.start.initialize.initial_splats`.
-    sweep : Sweep
-    sparse : Tensor [N] bool, optional
-        Splats of sparse points far from the swept ones; they keep their opacity, and their size up to
-        ``MAX_SPARSE_SIZE``.
+    colour. ``sparse`` ([N] bool) are splats of sparse points far from the swept ones; they keep their opacity, and
+    their size up to ``MAX_SPARSE_SIZE``.
     """
     sums, weights, pixel = _observations(splats.means.double().numpy(), sweep)
     sh0, shown = splats.sh0.clone(), weights > 0
@@ -52,16 +44,11 @@ def fit_start(splats: Splats, sweep: Sweep, sparse: Tensor | None = None) -> Spl
 
 
 def _observations(means: np.ndarray, sweep: Sweep) -> tuple[Tensor, Tensor, np.ndarray]:
-    """Return what the views of a sweep show of points [N, 3].
+    """Return what the views of a sweep show of points [N, 3]: two sums over the views, and sizes of pixels.
 
-    Returns
-    -------
-    sums : Tensor [N, 3] float64
-        Sum of C0 (colour - 1/2) over the views that show a point.
-    weights : Tensor [N] float64
-        Sum of C0^2 over the same views.
-    pixel : ndarray [N] world units
-        Size of a pixel at the point in the nearest view whose image contains it; infinite where none does.
+    The sums, float64, are those of C0 (colour - 1/2) [N, 3] and of C0^2 [N] over the views that show a point. The size
+    [N] (world units) is that of a pixel at the point in the nearest view whose image contains it; infinite where none
+    does.
     """
     sums, weights = torch.zeros(len(means), 3, dtype=torch.float64), torch.zeros(len(means), dtype=torch.float64)
     pixel = np.full(len(means), np.inf)

@@ -32,19 +32,8 @@ def start_points(
     """Return points to start from: swept ones, ones in gaps, and sparse ones that are far from the swept ones.
 
     For a fitted start, sparse points keep the size that they have among all sparse points (:attr:`PointCloud.sizes`).
-
-    Parameters
-    ----------
-    scene : Scene
-    sweep : Sweep
-    settings : DenseStart
-    around : tuple of ndarray, optional
-        Further points with sizes: positions, colours in [0, 1], normals [P, 3], sizes [P].
-
-    Raises
-    ------
-    DataError
-        If no view has a neighbour, or no depths agree.
+    ``around`` are further points with sizes: positions, colours in [0, 1], normals [P, 3], sizes [P]. Raises DataError
+    if no view has a neighbour, or no depths agree.
     """
     if not any(sweep.neighbours) and not _has_points(scene):
         raise DataError(

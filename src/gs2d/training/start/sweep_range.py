@@ -24,27 +24,17 @@ TRACK = 3  # track length of a grid point: ObservedPoints ignores shorter ones
 
 @dataclass(frozen=True, eq=False)
 class SweepRange:
-    """Depth range of each view.
+    """Depth range of each view."""
 
-    Attributes
-    ----------
-    observed : ObservedPoints
-        Sparse points or grid points, and which views show them.
-    limits : mapping of view name to (near, far) world units
-        Empty if the sparse points define the range.
-    """
-
-    observed: ObservedPoints
+    observed: ObservedPoints  # sparse points or grid points, and which views show them
+    # Near and far, world units, by name of the view; empty if the sparse points define the range.
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def sweep_range(scene: Scene) -> SweepRange:
     """Return the depth range of the training views of a scene.
 
-    Raises
-    ------
-    DataError
-        If no two training views show a point in the bounds of the scene.
+    Raises DataError if no two training views show a point in the bounds of the scene.
     """
     observed = scene.observed()
     return _range_of_bounds(scene) if observed is None else SweepRange(observed)
