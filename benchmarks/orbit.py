@@ -16,14 +16,14 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.mesh_images import mesh_images
+from gs2d.contrib.pictures.orbits import orbit_cameras
+from gs2d.contrib.pictures.pictures_command import RenderOptions
+from gs2d.contrib.pictures.render_run import render_run
 from gs2d.core.camera import Camera
 from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, RunFolder
-from gs2d.pipeline.finish.run_images import render_run
-from gs2d.pipeline.finish.viewpoints import orbit_cameras
 from gs2d.pipeline.prepare.loaded import reload_run
-from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.training.events import ignore
 
 

@@ -12,18 +12,20 @@ import numpy as np
 import pytest
 
 from ball_runs import Stop, options
+from gs2d.contrib.pictures.pictures_command import RenderOptions
+from gs2d.contrib.pictures.render_run import render_run
 from gs2d.data import View
 from gs2d.errors import DataError, DiskError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.finish.run_images import file_names, render_run
+from gs2d.pipeline.finish.run_images import file_names
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.splat_files import export_run
 from gs2d.pipeline.look.page import page_run
-from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions, RenderOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, StageScored
 from tiny import ball_cameras, write_ball_mesh
@@ -146,7 +148,7 @@ def test_a_rendering_does_not_overwrite_a_photograph(
     def plain(views: Sequence[View]) -> list[str]:
         return [Path(view.name).stem for view in views]  # as in captures without sub-folders
 
-    monkeypatch.setattr("gs2d.pipeline.finish.run_images.file_names", plain)
+    monkeypatch.setattr("gs2d.contrib.pictures.render_run.file_names", plain)
     image = capture / "test" / "r_0.png"
     before = image.read_bytes()
     with pytest.raises(RunError, match="--out"):
@@ -158,7 +160,7 @@ def test_a_rendering_does_not_overwrite_a_photograph(
 def test_a_failed_rendering_leaves_no_images_and_no_folder(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gs2d.pipeline.finish import run_images as render
+    from gs2d.contrib.pictures import render_run as render
 
     write = render.write_image
 

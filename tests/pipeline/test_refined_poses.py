@@ -13,18 +13,19 @@ import torch
 
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.config.quantities import QUANTITIES
+from gs2d.contrib.pictures.pictures_command import RenderOptions
+from gs2d.contrib.pictures.render_run import render_run
 from gs2d.core.transforms import perturb_pose
 from gs2d.data import load_scene
 from gs2d.errors import RunError
 from gs2d.evaluation.image_metrics import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.finish.evaluate import aligned, evaluate_run
-from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.learned_views import camera_motion
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
-from gs2d.pipeline.prepare.options import EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, Step, ignore
 from gs2d.training.learned.camera_pose import CameraPose

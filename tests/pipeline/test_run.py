@@ -16,15 +16,15 @@ from capture_writers import small_colmap
 from gs2d.contrib.capture.json_captures import read_blender
 from gs2d.contrib.demo.demo_command import DemoOptions
 from gs2d.contrib.demo.run_demo import demo
+from gs2d.contrib.pictures.pictures_command import RenderOptions
+from gs2d.contrib.pictures.render_run import render_run
 from gs2d.data.build import Capture
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.capture_readers import READERS
 from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.prepare.loaded import prepare_run
-from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, Phase, Step, ignore
 from tiny import write_capture

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gs2d.contrib.pictures.video import write_video
 from gs2d.data.image_files import write_image
 from gs2d.errors import BackendError
-from gs2d.io.video import write_video
 from gs2d.report.html_parts import image_tag
 
 SIDES = (1, 7, 64, 256, 257, 300, 360, 361, 520, 700)

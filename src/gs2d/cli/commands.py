@@ -15,7 +15,6 @@ from gs2d.pipeline.prepare.options import (
     MeshOptions,
     PosesOptions,
     ReconstructOptions,
-    RenderOptions,
     Resources,
     TextureOptions,
     TrainOptions,
@@ -44,7 +43,7 @@ class Command:
         getattr(importlib.import_module(module), function)(options, console)
 
 
-_CORE = "doctor reconstruct view poses train mesh info render export evaluate recipes"
+_CORE = "doctor reconstruct view poses train mesh info export evaluate recipes"
 COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE.split(), __name__))
 
 
@@ -134,19 +133,6 @@ class MeshCommand(TextureOptions, MeshOptions, Resources, Common):
     texture: bool = False
     """Write a textured mesh, as .glb or .obj, from the photographs. Without options that change the mesh, uses
     mesh.ply."""
-    threads: int | None = None
-    """CPU threads."""
-
-
-@_core("render", LOOK, "run", "split", "orbit", "width", "video", "out")
-@dataclass(frozen=True, kw_only=True)
-class RenderCommand(RenderOptions, Resources, Common):
-    """Render images or a video of a run."""
-
-    run: RunPath
-    """Run folder."""
-    out: Annotated[Path | None, Arg(metavar="DIR")] = None
-    """Folder of the images (default: renders/SPLIT or renders/orbit in the run)."""
     threads: int | None = None
     """CPU threads."""
 

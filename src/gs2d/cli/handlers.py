@@ -167,19 +167,6 @@ def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console
     console.result(result)
 
 
-def render(command: c.RenderCommand, console: Console) -> None:
-    """Run ``gs2d render``."""
-    from gs2d.pipeline.finish.run_images import render_run
-    from gs2d.pipeline.prepare.limits import use_memory
-
-    use_memory(command.memory)
-    result = render_run(command.run, command, console.on_event, out=command.out, threads=command.threads)
-    console.say(f"{result['images']} images in {result['folder']}")
-    if "video" in result:
-        console.say(f"{result['video']}: {result['seconds']:.1f} s, {result['video_bytes'] / 1e6:.1f} MB")
-    console.result(result)
-
-
 def view(command: c.ViewCommand, console: Console) -> None:
     """Run ``gs2d view`` until Ctrl-C."""
     from gs2d.pipeline.look.view import open_viewer, serve

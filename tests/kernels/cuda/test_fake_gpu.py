@@ -83,8 +83,9 @@ from gs2d.contrib.lab.surface_score import evaluate_surface
 from gs2d.contrib.lab import visible_surface
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
-from gs2d.pipeline.finish.run_images import render_run
-from gs2d.pipeline.prepare.options import RenderOptions, TrainOptions
+from gs2d.contrib.pictures.render_run import render_run
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.contrib.pictures.pictures_command import RenderOptions
 from gs2d.pipeline.train.train_run import train
 import tiny
 

@@ -273,20 +273,6 @@ class TextureOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RenderOptions(Options):
-    """Which images of a run are rendered."""
-
-    split: Literal["test", "train"] | None = None
-    """Views to render (default: test views, or training views where there are none)."""
-    orbit: int = 0
-    """Render N frames of a circle around the subject, or of an arc if only one side was photographed."""
-    width: Annotated[int | None, Arg(metavar="PIXELS")] = None
-    """Image width; the height follows (default: as in training)."""
-    video: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """With --orbit: also write a video with 30 frames a second, .mp4 (H.264, needs ffmpeg) or .webp."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(Options):
     """What `gs2d evaluate` measures."""
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gs2d.contrib.pictures.video import write_video
 from gs2d.data.image_files import write_image
 from gs2d.errors import BackendError, DiskError
-from gs2d.io.video import write_video
 
 real = pytest.mark.skipif(shutil.which("ffprobe") is None, reason="no ffmpeg here")
 WIDTH, HEIGHT = 48, 32

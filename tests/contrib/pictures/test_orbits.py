@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gs2d.contrib.pictures.orbits import orbit_cameras
 from gs2d.core.camera import Camera, look_at
-from gs2d.pipeline.finish.viewpoints import orbit_cameras
 
 UP = np.array([0.0, 0.0, 1.0])
 

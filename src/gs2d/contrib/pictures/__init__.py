@@ -1,0 +1,1 @@
+"""The command ``gs2d render``."""
