@@ -21,8 +21,10 @@ from gs2d.config.presets import (
     with_normal_prior,
     with_robustness,
 )
+from gs2d.config.protocols import get_protocol
 from gs2d.config.serialize import apply_overrides
 from gs2d.errors import RecipeError
+from gs2d.pipeline.prepare.open_capture import QUALITIES
 from tiny import write_capture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -95,6 +97,24 @@ def test_the_program_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(gs2d.read_splats(tmp_path / "splats.ply")) > 0
 
 
+def test_the_programs_of_the_pages_on_scores_and_gpus_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = gs2d.load_scene(write_capture(tmp_path / "capture"))
+    write_capture(tmp_path / "data" / "ball")
+    run_blocks(DOCS / "guides" / "evaluation.md", 1)
+    assert "ball" in capsys.readouterr().out
+    (tmp_path / "runs" / "x").mkdir(parents=True)
+    gs2d.train(scene, "2dgs", iterations=2).splats.save("runs/x/splats.ply")
+    text = (DOCS / "guides" / "gpu.md").read_text(encoding="utf-8")
+    for name, instead in {'.to("cuda")': "", "torch.cuda.stream(torch.cuda.Stream())": "torch.enable_grad()"}.items():
+        assert name in text  # here, on a CPU, without them
+        text = text.replace(name, instead)
+    (tmp_path / "gpu.md").write_text(text, encoding="utf-8")
+    assert run_blocks(tmp_path / "gpu.md", 1)["output"].color.shape[:2] == scene.train[0].image().shape[:2]
+
+
 def test_the_recipes_of_the_concepts_page_exist() -> None:
     names = run_blocks(DOCS / "concepts.md", 1)
     assert names["two_dgs_r"].stages == RECIPES["2dgs-r"]().stages
@@ -138,7 +158,10 @@ def test_a_python_block_is_complete_or_names_the_blocks_that_it_needs(page: Path
     assert {line: names for line, names in free.items() if names and not line.startswith("# continues ")} == {}
 
 
-# Options, defaults and files on the user pages are compared with the program.
+# Options, defaults and files on the user pages are compared with the program. A data file's name is a literal of the
+# program but for its EXAMPLES: a name of the user's own, a scene, a number.
+DATA = "ply|jsonl?|html|glb|obj|txt|np[yz]|png|tif|log|mat|xml|sfm|sog|spz|usd|webp|xyz|prj"
+EXAMPLES = r"\b(?:x|a|b|r_0|mine|stl024|Barn|NAME|VIEW\.KIND)(?![a-z])|24"
 NO_USER_PAGES = {"CHANGELOG", "kernels", "math"}
 USER_PAGES = [page for folder in ("..", ".", "guides", "tutorials") for page in sorted((DOCS / folder).glob("*.md"))]
 USER_PAGES = [page for page in USER_PAGES if page.stem not in NO_USER_PAGES]
@@ -184,6 +207,32 @@ def test_defaults_on_a_page_are_current(page: Path) -> None:
             assert ALL_OPTIONS[flag].default in (value, None), flag
 
 
+def test_defaults_that_no_option_stands_beside_are_current() -> None:
+    draft, normal, quantity = QUALITIES["draft"], QUALITIES["normal"], gs2d.Quantity("poses")
+    count = {name: f"{RECIPES[name]().iterations:,}" for name in ("best", "best-fast", "2dgs", "2dgs-60k", "2dgs-r")}
+    stated = {
+        "concepts.md": ["seed 0.", "recipe [`best`]"],
+        "migration.md": [f"(near=0.01)` | default {gs2d.RasterSettings().near:g},", "`load_scene(path, test_every=8)`"],
+        "extending.md": ["`rate` (default 1e-3) to `rate_final` (1e-5)"],
+        "guides/photographs.md": [
+            f"{draft['cpu'].iterations} iterations at about {draft['cpu'].side} px",
+            f"| {draft['gpu'].iterations} at {draft['gpu'].side} px |",
+            f"| `normal` | {normal['cpu'].iterations} at {normal['cpu'].side} px | {normal['gpu'].iterations:,} at",
+            f"the default: {count['best']})",
+        ],
+        "guides/commands.md": [
+            f"| `best` (default) | {count['best']} |",
+            f"| `best-fast` | {count['best-fast']} |",
+            f"| `2dgs`, `2dgs-60k` | {count['2dgs']}; {count['2dgs-60k']} |",
+            f"| `2dgs-r` | {count['2dgs-r']} |",
+        ],
+    }
+    pages = {page: (DOCS / page).read_text(encoding="utf-8") for page in stated}
+    assert [text for page, texts in stated.items() for text in texts if text not in pages[page]] == []
+    assert (OPTIONS["train"]["--seed"].default, quantity.rate, quantity.rate_final) == (0, 1e-3, 1e-5)
+    assert (gs2d.list_recipes()[0], get_protocol("generic").test_every) == ("best", 8)
+
+
 def test_files_on_the_pages_exist() -> None:
     written = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
     foreign = {"crisp.py", "metrics.py"}  # of a tutorial, of the official code
@@ -199,6 +248,9 @@ def test_files_on_the_pages_exist() -> None:
                 *(ROOT / "tests").rglob(path),
             ]:
                 missing.append((page.name, path))
+        for name in re.findall(rf"`(?:[\w.-]+/)*([\w.-]*\w\.(?:{DATA}))`", text):
+            if not (all(part in written for part in re.split(EXAMPLES, name)) or (ROOT / name).is_file()):
+                missing.append((page.name, name))
     table = re.findall(
         r"^\| ((?:`[\w./]+`(?:, )?)+) \|", (DOCS / "guides" / "runs.md").read_text(encoding="utf-8"), re.M
     )

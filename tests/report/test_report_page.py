@@ -20,6 +20,7 @@ from PIL import Image
 from gs2d.contrib.lab.surface_section import surface_section
 from gs2d.core.camera import look_at
 from gs2d.core.json_files import write_json
+from gs2d.data.subject_box import Subject
 from gs2d.errors import DataError, RunError
 from gs2d.report import mesh_view as report_view
 from gs2d.report.mesh_view import MeshView, mesh_view
@@ -28,6 +29,7 @@ from gs2d.report.report_page import write_report
 from gs2d.report.run_record import RunRecord
 from gs2d.report.sections.results_section import results_section
 from gs2d.report.sections.section_registry import SECTIONS
+from gs2d.report.sections.settings_section import settings_section
 from report_runs import KNOT, definition, events, fabricate, stage_entry
 
 VOID = {"meta", "img", "br", "input"}
@@ -136,6 +138,18 @@ def test_settings_are_listed_and_names_from_files_are_escaped(page: str) -> None
     assert "Depth, after refine, 1.5 to 4.25 world units" in text
     assert "colours in [0, 1] 0 0.2 and more" in text
     assert "still <life>" not in page
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"), [("object", "9 cameras look at it"), ("scene", "the whole scene: 9 cameras")]
+)
+def test_the_settings_describe_the_subject(kind: str, line: str, tmp_path: Path) -> None:
+    box = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 2.0]])
+    subject = Subject(kind, *box, box.mean(axis=0), np.array([0.0, 0.0, 1.0]), "9 cameras look at it")
+    write_json(tmp_path / "subject.json", subject.to_json())
+    pairs = str(settings_section(record(path=tmp_path)))
+    assert f"<dt>Subject</dt><dd>{line}" in pairs
+    assert "--subject-box -1 -1 0 1 1 2" in pairs
 
 
 def test_a_folder_that_is_no_run_is_an_error_and_a_broken_file_loses_only_its_part(tmp_path: Path) -> None:

@@ -276,6 +276,21 @@ def test_keys_open_help_show_normals_and_depth_and_step_through_photographs(page
     still(page)
 
 
+def test_motion_draws_only_the_most_important_splats_and_rest_draws_all(page: Page) -> None:
+    assert values(page, "MOVING_SPLATS", "count") == [500_000, 2]
+    page.ask("window.adaptation = adapt; adapt = () => (movingLimit = 1); movingLimit = 1")
+    page.key("t")
+    page.until("count === 1 && drawn === wanted")
+    page.key("t")
+    still(page)
+    assert values(page, "count") == [2]
+    page.ask("adapt = adaptation; scale = 1")
+    slow = "window.now = performance.now(); performance.now = () => (window.now += 70); adapt(performance.now());"
+    page.ask(slow * 8 + "delete performance.now")  # frames of 70 ms
+    assert values(page, "scale", "movingLimit") == [0.4, 50_000]
+    page.ask("[scale, movingLimit] = [1, MOVING_SPLATS]")
+
+
 def set_mip_filter(page: Page, sigma: float) -> None:
     facts = replace(SETTINGS, mip_px=sigma)
     page.ask(f"Object.assign(facts, {{mip: {sigma}, lowpass: {facts.clamp_px}}}); gl.useProgram(splatProgram.program);"

@@ -1,4 +1,4 @@
-"""Orbits around the subject."""
+"""Orbits around the subject, and the directions to which the page limits visitors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 
 from gs2d.contrib.pictures.orbits import orbit_cameras
 from gs2d.core.camera import Camera, look_at
+from gs2d.data.subject_box import Subject
+from gs2d.viewer.opening_view import photographed_arc
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -29,3 +31,17 @@ def test_an_orbit_stays_within_the_photographed_arc() -> None:
     assert np.linalg.norm(centers[-1] - centers[0]) < 0.1
     for camera in orbit:
         np.testing.assert_allclose(camera.forward, -camera.center / np.linalg.norm(camera.center), atol=1e-9)
+
+
+def test_a_relief_is_shown_from_the_photographed_heights() -> None:
+    turns, heights = np.radians([-30, -10, 10, 30]), (0.6, 1.0, 1.8, 1.2)
+    relief = [looking((4 * np.cos(a), 4 * np.sin(a), z), (0, 0, 0)) for a, z in zip(turns, heights, strict=True)]
+    orbit = np.array([camera.center[2] for camera in orbit_cameras(relief, 24, np.zeros(3))])
+    assert orbit.min() > 0.6
+    assert orbit.max() < 1.8
+    assert np.ptp(orbit) > 0.3
+    subject = Subject("object", -np.ones(3), np.ones(3), np.zeros(3), UP, "a test")
+    arc = photographed_arc(relief, subject, UP)
+    lowest, highest = np.degrees(np.arctan([0.6 / 4, 1.8 / 4]))
+    np.testing.assert_allclose(np.degrees([arc.low, arc.high]), [lowest - 12, highest + 20], atol=1e-6)
+    np.testing.assert_allclose([np.degrees(arc.half), *arc.middle], [30 + 12, 1, 0, 0], atol=1e-6)

@@ -194,7 +194,7 @@ def _quality(measures: Measures) -> list[Finding]:
     train = [view.psnr for view in measures.views if view.split == "train" and view.psnr is not None]
     trained = fmean(train) if train else None
     if not test:
-        text = "All photographs trained. --test-every 8 holds out every eighth photograph to check new views."
+        text = "All photographs were used for training. --test-every 8 holds out every eighth to check new views."
         few = measures.count is not None and measures.count < FEW
         advice = f"Take 30 or more photographs: with {measures.count}, new views were not checked." if few else ""
         new = Finding("new views", None, NOT_MEASURED, text, advice)
@@ -208,7 +208,7 @@ def _quality(measures: Measures) -> list[Finding]:
     if grade != GOOD and trained is not None and trained - psnr <= grades.OVERFIT:
         advice = _train_longer(trained)
     elif grade != GOOD or grades.NEW_VIEWS.grade(low) == POOR:
-        advice = f"Take more photographs near what {name} shows; longer training will not help there."
+        advice = f"Take more photographs of what {name} shows; longer training will not help there."
     figure = f"{psnr:.1f} dB" + (f", worst {low:.1f} dB" if len(test) > 1 else "")
     text = f"Mean PSNR of {len(test)} held-out photograph{'s' * (len(test) > 1)}; {name} is the worst."
     return [Finding("new views", grade, figure, text, advice, (name,))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gs2d.data.subject_box import read_subject
+from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.report.html_parts import macro
 from gs2d.report.run_record import RunRecord, name_of
 from gs2d.report.sections.section_registry import register_section
@@ -23,7 +23,8 @@ def _subject(run: RunRecord) -> list[tuple[str, str]]:
     if subject is None:
         return []
     box = " ".join(f"{value:.4g}" for value in subject.box.ravel())
-    return [("Subject", f"{subject.kind}: {subject.why}"), ("Subject box", f"--subject-box {box}")]
+    why = subject.why if subject.kind == OBJECT else f"the whole scene: {subject.why}"
+    return [("Subject", why), ("Subject box", f"--subject-box {box}")]
 
 
 def _settings(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
