@@ -16,30 +16,13 @@ import pytest
 
 import gs2d
 
-FACE = (
-    *("load_scene", "train", "Trainer", "Recipe", "Stage", "get_recipe", "list_recipes", "compute_losses"),
-    *(
-        "rasterize",
-        "rasterize_2dgs",
-        "splat_errors",
-        "splat_sums",
-        "read_splats",
-        "write_splats",
-        "extract_mesh",
-        "evaluate",
-    ),
-    *("Camera", "Splats", "Scene", "Mesh", "MeshOptions", "TrainOptions", "Protocol", "LossTerm"),
-    *(
-        "register_loss",
-        "register_action",
-        "register_densifier",
-        "register_quantity",
-        "register_recipe",
-        "register_reader",
-        "register_backend",
-    ),
-    *("register_format", "register_section", "perturb_pose", "rgb_to_sh0", "normals_from_depth", "write_mesh"),
-)
+FACE = """
+    load_scene train Trainer Recipe Stage get_recipe list_recipes compute_losses rasterize rasterize_2dgs
+    splat_errors splat_sums read_splats write_splats extract_mesh evaluate Camera Splats Scene Mesh
+    MeshOptions TrainOptions Protocol LossTerm register_loss register_action register_densifier
+    register_quantity register_recipe register_reader register_backend register_format register_section
+    perturb_pose rgb_to_sh0 normals_from_depth write_mesh
+""".split()
 
 
 def test_public_names_are_public_in_their_modules() -> None:

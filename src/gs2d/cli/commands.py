@@ -120,7 +120,7 @@ class TrainCommand(TrainOptions, Common):
 @_core("mesh", STEPS, "run", "out", "texture", "method", "refine", "voxel", "bbox")
 @dataclass(frozen=True, kw_only=True)
 class MeshCommand(TextureOptions, MeshOptions, Resources, Common):
-    """Extract the mesh of a run again, with other settings; or that of a file of splats."""
+    """Extract the mesh of a run with other settings, or the mesh of a splat file."""
 
     run: Annotated[Path | None, Arg(metavar="RUN", positional=True)] = None
     """Run folder."""

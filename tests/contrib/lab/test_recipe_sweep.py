@@ -55,6 +55,7 @@ def test_another_recipe_adds_a_row_and_trains_only_what_is_new(swept: tuple[Path
 @pytest.mark.parametrize(
     ("words", "named"),
     [
+        (["module"], "no recipe and no table of the paper 'module'; did you mean modules?"),
         (["2dgs", "2dgs-rr"], "no recipe '2dgs-rr'; `gs2d recipes --all` lists them; did you mean 2dgs-r?"),
         ([], "gs2d sweep needs RECIPE [RECIPE ...]; see `gs2d sweep --help`"),
         (["2dgs", "--set", "refine.iterations=5"], "--set refine.iterations=5 fits no recipe of the table"),

@@ -32,7 +32,7 @@ class EditOptions(Options):
 @register_command("edit", action="gs2d.contrib.edit.edit_splats:show_edit", group=LOOK)
 @dataclass(frozen=True, kw_only=True)
 class EditCommand(EditOptions, Common):
-    """Delete, merge or move splats of a run, undoably, or of a file."""
+    """Delete, merge or move splats of a run, with undo, or of a file."""
 
     run: RunPath
     """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""

@@ -96,7 +96,7 @@ class BlocksOptions(CommonTraining, Resources):
     """Folder of a capture, as in `gs2d train`."""
     out: Annotated[Path, Arg(metavar="JOB")]
     """Run folder of the merged scene. The same command continues an interrupted one."""
-    blocks: str = "auto"
+    blocks: Annotated[str, Arg(metavar="GRID")] = "auto"
     """Blocks on the ground, such as 3x3, or in space, such as 2x2x2 (auto: as many as --memory requires)."""
     overrides: Overrides = ()
     """Change the recipe, e.g. --set surface.iterations=2000, or the partition, e.g. --set partition.margin=0.3; may be

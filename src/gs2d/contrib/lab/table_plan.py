@@ -9,12 +9,13 @@ from dataclasses import dataclass, fields
 from typing import Any, get_type_hints
 
 from gs2d.config.arguments import Arg
-from gs2d.config.presets import get_recipe
+from gs2d.config.presets import RECIPES, get_recipe
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.recipe_files import short_name
+from gs2d.config.registry import did_you_mean
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
-from gs2d.contrib.lab.lab_options import SWEEP, SweepOptions
+from gs2d.contrib.lab.lab_options import SWEEP, TABLES, SweepOptions
 from gs2d.contrib.lab.paper_tables import PAPER_TABLES, PaperTable, recipe_table
 from gs2d.contrib.lab.scenes import SweepScene, find_scenes
 from gs2d.contrib.lab.training_task import TrainingTask, stage_keys
@@ -66,6 +67,8 @@ def _table(options: SweepOptions) -> PaperTable:
     if not options.recipes:
         raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
     for name in options.recipes:
+        if name not in RECIPES and (near := did_you_mean(name, TABLES)):
+            raise RecipeError(f"no recipe and no table of the paper {name!r}{near}")
         get_recipe(name)  # unknown names raise first
     return recipe_table(options.recipes)
 

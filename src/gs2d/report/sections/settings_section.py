@@ -39,7 +39,6 @@ def _settings(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
     for name in ("seed", "downscale", "created"):
         pairs += [(name.capitalize(), str(definition[name]))] if definition.get(name) is not None else []
     for name in ("machine", "versions"):
-        pairs.append(
-            (name.capitalize(), ", ".join(f"{key} {value}" for key, value in definition.get(name, {}).items()))
-        )
+        text = ", ".join(f"{key} {value}" for key, value in definition.get(name, {}).items())
+        pairs.append((name.capitalize(), text))
     return pairs
