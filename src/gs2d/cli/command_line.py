@@ -195,9 +195,7 @@ def groups() -> dict[str, list[str]]:
 
 def program_help(*, everything: bool = False) -> list[str]:
     """Return all commands in groups; with ``everything`` also all options of each."""
-    parser = _parser(
-        "gs2d", "gs2d COMMAND [OPTIONS]", _SLOGAN, "Options of a command: gs2d COMMAND --help. Version: gs2d --version"
-    )
+    parser = _parser("gs2d", "gs2d COMMAND [OPTIONS]", _SLOGAN, "Options: gs2d COMMAND --help. Version: gs2d --version")
     for title, names in groups().items():
         group = parser.add_argument_group(title)
         for name in names:
