@@ -221,7 +221,7 @@ def test_files_on_the_pages_exist() -> None:
         everything = page.read_text(encoding="utf-8")
         text = re.sub(r"^```.*?^```$", "", everything, flags=re.M | re.S)
         measured = [f"{name.replace('.', '/')}.py" for name in re.findall(r"-m (benchmarks\.\w+)", everything)]
-        for path in [*measured, *re.findall(r"`([\w/.-]+\.(?:py|sh|h|toml))[`:]", text)]:
+        for path in [*measured, *re.findall(r"`([\w/.-]+\.(?:py|sh|h|toml))(?:`|: )", text)]:
             if path not in foreign and not [
                 *ROOT.glob(path),
                 *(ROOT / "src").rglob(path),
