@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -44,19 +45,19 @@ def test_a_count_may_leave_its_tolerance_in_neither_direction() -> None:
     assert "committed file has backward" in instructions.excess({"forward": 1}, {"backward": 1}, 0.02)[0]
 
 
-def test_the_avx2_library_executes_as_many_instructions_as_committed(committed: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("count", "name", "tolerance"),
+    [
+        (instructions.callgrind_counts, "callgrind_avx2", instructions.CALLGRIND_TOLERANCE),  # of the whole library
+        (instructions.loop_counts, "loops_avx512", instructions.LOOP_TOLERANCE),  # of the blend loops
+    ],
+)
+def test_as_many_instructions_as_committed(
+    committed: dict[str, Any], count: Callable[[], dict[str, int]], name: str, tolerance: float
+) -> None:
     try:
-        counts = instructions.callgrind_counts()
+        counts = count()
     except instructions.Unavailable as reason:
         pytest.skip(str(reason))
-    over = instructions.excess(counts, committed["callgrind_avx2"], instructions.CALLGRIND_TOLERANCE)
-    assert not over, f"{over}; if it is meant: python -m benchmarks.instructions --update"
-
-
-def test_the_avx512_blend_loops_are_as_long_as_committed(committed: dict[str, Any]) -> None:
-    try:
-        counts = instructions.loop_counts()
-    except instructions.Unavailable as reason:
-        pytest.skip(str(reason))
-    over = instructions.excess(counts, committed["loops_avx512"], instructions.LOOP_TOLERANCE)
+    over = instructions.excess(counts, committed[name], tolerance)
     assert not over, f"{over}; if it is meant: python -m benchmarks.instructions --update"

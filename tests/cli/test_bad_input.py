@@ -15,14 +15,6 @@ from gs2d.cli import run
 from tiny import write_capture
 
 
-def missing(folder: Path) -> None:
-    """Nothing there."""
-
-
-def empty(folder: Path) -> None:
-    folder.mkdir()
-
-
 def truncated_images_bin(folder: Path) -> None:
     small_colmap(folder)
     path = folder / "sparse/0/images.bin"
@@ -80,8 +72,6 @@ def meshroom_before_its_poses(folder: Path) -> None:
         (cut_json_of_opensfm, "reconstruction.json"),
         (xml_of_metashape_without_images, "listed in cameras.xml"),
         (meshroom_before_its_poses, "StructureFromMotion"),
-        (missing, "capture"),
-        (empty, "capture"),
         (truncated_images_bin, "images.bin"),
         (unsupported_camera, "RAD_TAN_THIN_PRISM_FISHEYE"),
         (wrong_json_key, "transform_matrix"),
@@ -198,27 +188,6 @@ def test_a_folder_that_holds_a_run_or_something_else_is_kept(
     assert run(["train", str(capture), "--out", str(tmp_path), "--overwrite"]) == 2
     assert "mine.txt" in one_line(capsys.readouterr().err)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_a_failing_overwrite_keeps_the_old_run(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = tmp_path / "run"
-    shutil.copytree(trained, copy)
-    image_that_does_not_decode(tmp_path / "capture")
-    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
-    assert run(["train", str(tmp_path / "capture"), "--out", str(copy), "--overwrite", "--quiet"]) == 2
-    one_line(capsys.readouterr().err)
-    assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
-
-
-@pytest.mark.parametrize("command", ["mesh", "render", "evaluate"])
-def test_a_command_on_a_path_that_is_no_run_names_what_it_is(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run([command, str(tmp_path)]) == 2
-    assert "run.json" in one_line(capsys.readouterr().err)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -108,18 +108,6 @@ def test_train_shows_a_table_and_where_the_report_is(
     assert str(out / "report.html") in text
 
 
-def test_mesh_render_and_export_work_on_a_run(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    name = str(trained)
-    assert run(["mesh", name, "--out", str(tmp_path / "m.ply"), "--set", "voxel=0.1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["voxel"] == pytest.approx(0.1)
-    assert run(["render", name, "--split", "train", "--out", str(tmp_path / "views"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["images"] == 3
-    assert run(["export", name, "--format", "3dgs", "--out", str(tmp_path / "s.ply"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["bytes"] == (tmp_path / "s.ply").stat().st_size
-
-
 def test_evaluate_shows_what_is_missing_and_scores_the_surface(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

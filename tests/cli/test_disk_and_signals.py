@@ -139,20 +139,6 @@ def test_a_stdout_that_cannot_be_written_is_not_an_internal_error(
     assert len(done.stderr.splitlines()) == bool(message)
 
 
-def test_ctrl_c_before_the_first_iteration_leaves_no_run(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from gs2d.training.trainer import Trainer
-
-    def interrupted(_self: Trainer) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Trainer, "step", interrupted)
-    assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
-    assert capsys.readouterr().err.startswith(RESUME)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     "error",
     [

@@ -18,7 +18,6 @@ from gs2d.config.presets import (
 )
 from gs2d.config.recipe import DenseStart, GradDensify, Removal
 from gs2d.config.schedule import scale_schedule
-from gs2d.config.serialize import from_json, to_json
 
 NAMES = ("best", "best-fast")
 
@@ -63,12 +62,6 @@ def test_view_dependent_colours_learn_faster_except_with_few_images(name: str, s
     weights = {term.kind: term.weight for term in stage.losses if term.kind != "l2"}
     weights["normal_consistency"] = NC_WITHOUT_SQUARES
     assert {term.kind: term.weight for term in slow.losses} == weights
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_best_recipes_are_written_and_read(name: str) -> None:
-    recipe = get_recipe(name)
-    assert from_json(to_json(recipe)) == recipe
 
 
 def test_robust_training_has_its_own_start_and_no_prune_by_size() -> None:

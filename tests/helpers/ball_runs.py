@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,3 +45,12 @@ def spawn(capture: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
     for override in SMALL:
         words += ["--set", override]
     return subprocess.Popen(words, env=dict(os.environ), stderr=subprocess.PIPE)
+
+
+def failing(error: Exception) -> Callable[..., Any]:
+    """Return a function that raises an error."""
+
+    def fail(*_args: Any, **_kwargs: Any) -> None:
+        raise error
+
+    return fail

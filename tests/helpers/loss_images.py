@@ -10,6 +10,14 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.losses import formulas
 from gs2d.render.types import RenderOutput
 
+CONSISTENCIES = [  # edges, weighted, per_splat, masked: each pair of values occurs at least once
+    ("undefined", False, False, True),
+    ("undefined", True, True, False),
+    ("undefined", True, False, True),
+    ("camera", False, False, False),
+    ("camera", False, True, True),
+]
+
 
 def make_camera(width: int, height: int) -> Camera:
     """Return a camera without symmetries."""

@@ -38,5 +38,9 @@ def resumed_everywhere(scene: Scene, recipe: Recipe, backend: str, every: int = 
     )
     end = trainer.run()
     for data in saves[::every]:
-        assert same(Trainer(scene, recipe, GENERIC, backend=backend, state=reload(data)).run(), end)
+        resumed = Trainer(scene, recipe, GENERIC, backend=backend, state=reload(data))
+        assert same(resumed.run(), end)
+        for name, rows in resumed.state.learned.items():
+            assert torch.equal(rows.values, trainer.state.learned[name].values), name
+            assert rows.steps == trainer.state.learned[name].steps
     return end

@@ -12,7 +12,7 @@ from gs2d.kernels.library import Library
 from gs2d.kernels.loss_operations import NormalOptions
 from gs2d.kernels.native_losses import NativeLosses
 from gs2d.losses import formulas as reference
-from loss_images import geometry, photographs, relative_error, wide_camera
+from loss_images import CONSISTENCIES, geometry, photographs, relative_error, wide_camera
 
 SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]
 
@@ -38,16 +38,7 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
         assert relative_error(found, expected) < 1e-5
 
 
-@pytest.mark.parametrize(
-    ("edges", "weighted", "per_splat", "masked"),  # each pair of values occurs at least once
-    [
-        ("undefined", False, False, True),
-        ("undefined", True, True, False),
-        ("undefined", True, False, True),
-        ("camera", False, False, False),
-        ("camera", False, True, True),
-    ],
-)
+@pytest.mark.parametrize(("edges", "weighted", "per_splat", "masked"), CONSISTENCIES)
 @pytest.mark.parametrize("size", SIZES)
 def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     native: Library, size: tuple[int, int], per_splat: bool, masked: bool, edges: str, weighted: bool

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import itertools
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from ball_runs import SCALE, SMALL, options
+from ball_runs import SCALE, SMALL, failing, options
 from gs2d.cli import run as gs2d
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
@@ -35,13 +33,6 @@ LATER = {  # steps after training, with the result that is missing if they fail
     "finish.run_report.report_run": "report.html",
 }
 ERRORS = (DataError("the points are gone"), ZeroDivisionError("a fault"))
-
-
-def failing(error: Exception) -> Callable[..., Any]:
-    def fail(*_args: Any, **_kwargs: Any) -> None:
-        raise error
-
-    return fail
 
 
 @pytest.fixture

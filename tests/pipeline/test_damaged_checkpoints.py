@@ -116,13 +116,20 @@ def test_a_checkpoint_with_inconsistent_entries_is_skipped(
     assert "\n" not in said[0]
 
 
+@pytest.mark.parametrize("readable", [True, False])
 def test_training_from_the_previous_checkpoint_ends_with_the_same_bytes(
-    capture: Path, stopped: RunFolder, undisturbed: RunFolder, tmp_path: Path
+    capture: Path, stopped: RunFolder, undisturbed: RunFolder, tmp_path: Path, readable: bool
 ) -> None:
     run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
     last = run.checkpoints()[-1].path
-    save_tensors(last, with_change(load_tensors(last), ("state", "statistics", "signed"), lambda _: ...))
-    assert comparable(train(options(capture, run.path, resume=True))) == comparable(undisturbed)
+    if readable:
+        save_tensors(last, with_change(load_tensors(last), ("state", "statistics", "signed"), lambda _: ...))
+    else:
+        last.write_bytes(b"damaged")
+    heard: list[Event] = []
+    assert comparable(train(options(capture, run.path, resume=True), heard.append)) == comparable(undisturbed)
+    said = [event.text for event in heard if isinstance(event, Notice)]
+    assert any(f"{last.name} is not a readable checkpoint" in text for text in said)
 
 
 def test_a_damaged_stage_in_a_cache_is_trained_and_stored_again(

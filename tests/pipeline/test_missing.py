@@ -5,11 +5,10 @@ from __future__ import annotations
 import errno
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from ball_runs import options
+from ball_runs import failing, options
 from gs2d.core.atomic_files import disk_error
 from gs2d.errors import DiskError, ProtocolError
 from gs2d.io.run_dir import RunFolder
@@ -19,13 +18,6 @@ from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, NotMade
 
 MADE = ("mesh.ply", "report.html", "scene.html")
-
-
-def failing(error: Exception) -> Any:
-    def fail(*_args: Any, **_kwargs: Any) -> None:
-        raise error
-
-    return fail
 
 
 @pytest.fixture

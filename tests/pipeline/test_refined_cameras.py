@@ -64,6 +64,7 @@ def test_resized_photographs_have_the_refined_focal_length(run: RunFolder) -> No
     larger = _views(job, TextureOptions(texture_downscale=2), ignore, 1)
     for view, here in zip(larger, job.scene.train, strict=True):
         assert view.camera.width == here.camera.width // 2
+        assert np.array_equal(view.camera.T_cam_world, here.camera.T_cam_world)
         assert view.camera.fx == pytest.approx(here.camera.fx / 2)
 
 

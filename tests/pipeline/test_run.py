@@ -214,11 +214,6 @@ def test_every_nth_view_is_a_test_view(tmp_path: Path, every: int, test: int) ->
     assert (len(job.scene.train), len(job.scene.test)) == (8 - test, test)
 
 
-def test_test_every_is_an_error_for_a_capture_with_a_split(capture: Path, tmp_path: Path) -> None:
-    with pytest.raises(ProtocolError, match="--test-every: .* has its own test views; omit the option"):
-        prepare_run(options(capture, tmp_path / "run", test_every=4), ignore)
-
-
 def test_a_reader_of_a_package_can_define_the_split(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -153,7 +153,7 @@ def test_21_gradient_rows_are_refused(backend: Backend) -> None:
         rasterize(splats, learning(camera)[0], backend=backend, gradient_rows=rows)
 
 
-def test_21_the_bits_do_not_depend_on_the_number_of_threads(cpu: Backend) -> None:
+def test_20_21_the_bits_do_not_depend_on_the_number_of_threads(cpu: Backend) -> None:
     rng = np.random.default_rng(0)
     camera, found, before = random_camera(rng), [], torch.get_num_threads()
     splats = random_splats(rng, camera, 5000, ("tiny",)).to(torch.float32)
@@ -161,13 +161,16 @@ def test_21_the_bits_do_not_depend_on_the_number_of_threads(cpu: Backend) -> Non
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
             lens, intrinsics = learning(camera)
-            rasterize(splats, lens, backend=cpu).color.square().mean().backward()
-            found.append(intrinsics.grad)
+            pose = torch.tensor(camera.T_cam_world, requires_grad=True)
+            output = rasterize(splats, replace(lens, T_cam_world=pose), backend=cpu)
+            (output.color.square().mean() + output.normal[..., 0].mean()).backward()
+            found.append([intrinsics.grad, pose.grad])
     finally:
         torch.set_num_threads(before)
-    assert found[0] is not None
-    assert found[0].any()
-    assert all(torch.equal(found[0], other) for other in found[1:])
+    for first, *others in zip(*found, strict=True):
+        assert first is not None
+        assert first.any()
+        assert all(torch.equal(first, other) for other in others)
 
 
 def test_21_intrinsics_that_moved_on_without_their_camera_are_refused(cpu: Backend) -> None:
@@ -191,21 +194,3 @@ def test_21_a_camera_of_another_size_learns_the_same_intrinsics(cpu: Backend) ->
         rasterize(splats.to(torch.float32), scaled, backend=cpu).color.sum().backward()
         assert of_scaled.grad is not None
         assert_close(intrinsics.grad, factor * of_scaled.grad)
-
-
-def test_a_perturbed_focal_length_converges_to_that_of_its_image(cpu: Backend) -> None:
-    rng = np.random.default_rng(0)
-    camera = replace(random_camera(rng), width=40, height=30, fx=40.0, fy=40.0, cx=20.0, cy=15.0)
-    splats = random_splats(rng, camera, 60, ("plain",)).to(torch.float32)
-    image = rasterize(splats, camera, backend=cpu).color
-    start = torch.tensor([42.0, 39.0, 20.5, 14.6])
-    offset = torch.zeros(4, requires_grad=True)
-    optimizer = torch.optim.Adam([offset], lr=0.05)
-    for _ in range(150):
-        optimizer.zero_grad()
-        intrinsics = start + offset
-        fx, fy, cx, cy = intrinsics.tolist()
-        lens = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, intrinsics=intrinsics)
-        (rasterize(splats, lens, backend=cpu).color - image).abs().mean().backward()
-        optimizer.step()
-    assert_close((start + offset).detach(), torch.tensor([40.0, 40.0, 20.0, 15.0]), rtol=0.0, atol=0.2)

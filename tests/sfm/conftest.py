@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,14 @@ def colmap() -> None:
     """Skip if pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("no pycolmap: pip install pycolmap")
+
+
+@pytest.fixture(scope="session")
+def pycolmap(colmap: None) -> Any:
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    return pycolmap
 
 
 @pytest.fixture(scope="session")

@@ -19,14 +19,6 @@ SIZE = (400, 300)
 F = 150.0
 
 
-@pytest.fixture(scope="module")
-def pycolmap(colmap: None) -> Any:
-    import pycolmap
-
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    return pycolmap
-
-
 class _Database:
     """Matches between images of random points through a lens, with 0.3 px noise and a tenth of outliers."""
 

@@ -12,14 +12,6 @@ from synthetic_model import HEIGHT, WIDTH, synthetic_model
 F, CX, CY = 520.0, 320.0, 240.0
 
 
-@pytest.fixture(scope="module")
-def pycolmap(colmap: None) -> Any:
-    import pycolmap
-
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    return pycolmap
-
-
 @pytest.mark.parametrize(
     ("params", "plausible"),
     [

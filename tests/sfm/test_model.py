@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import importlib.util
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,12 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli_runs import one_line
-from gs2d.cli import run
 from gs2d.data.readers.colmap import ColmapImage, ColmapPoints
-from gs2d.errors import BackendError, DataError, RunError
+from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.sfm.colmap_process import MatchCounts, Request, check_installed, solve
+from gs2d.sfm.colmap_process import MatchCounts, Request, solve
 from gs2d.sfm.compare import device_of
 from gs2d.sfm.model import SfmModel, why_not_placed
 from gs2d.sfm.workspace import check_out, put_in_place, workspace
@@ -120,18 +116,6 @@ def test_features_are_on_the_gpu_where_colmap_was_built_for_it_until_that_failed
         return str(device_of(SimpleNamespace(has_cuda=cuda, Device=SimpleNamespace(cpu="cpu", cuda="cuda")), asked))
 
     assert [chosen(False), chosen(True), chosen(True, on_cpu=True)] == ["cpu", "cuda", "cpu"]
-
-
-def test_without_pycolmap_the_error_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
-    with pytest.raises(BackendError):
-        check_installed()
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "broken.jpg").write_bytes(b"x")
-    assert run(["poses", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 2
-    assert "pip install 'pycolmap>=" in one_line(capsys.readouterr().err)
 
 
 # -- output folders ----------------------------------------------------------------------------------------------------

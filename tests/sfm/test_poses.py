@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from PIL import Image
 from cli_runs import one_line
 from gs2d.cli import run
 from gs2d.core.camera import look_at
+from gs2d.core.similarity import apply, similarity_scale, umeyama
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images
@@ -34,22 +34,13 @@ def poses(photos: Path, out: Path, *words: str) -> int:
     return run(["poses", str(photos), "--out", str(out), "--threads", "2", *words])
 
 
-def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return scale, rotation and translation that map ``source`` to ``target`` by least squares (Umeyama 1991)."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    d = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-    R = (u * d) @ vt
-    scale = float((s * d).sum() / (a**2).sum())
-    return scale, R, target.mean(axis=0) - scale * R @ source.mean(axis=0)
-
-
 def pose_errors(mine: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> tuple[float, float, np.ndarray]:
     """Return the rms centre error relative to the spread, the largest angle in degrees, and the rotation [3, 3]."""
     names = sorted(mine.keys() & truth.keys())
-    centers, targets = (np.stack([-T[n][:3, :3].T @ T[n][:3, 3] for n in names]) for T in (mine, truth))
-    scale, R, t = similarity(centers, targets)
-    off = np.linalg.norm(scale * centers @ R.T + t - targets, axis=1)
+    centers, targets = (np.stack([-of[n][:3, :3].T @ of[n][:3, 3] for n in names]) for of in (mine, truth))
+    T = umeyama(centers, targets)
+    R = T[:3, :3] / similarity_scale(T)
+    off = np.linalg.norm(apply(T, centers) - targets, axis=1)
     spread = np.linalg.norm(targets - targets.mean(axis=0), axis=1).mean()
     cosines = [(np.trace(mine[n][:3, :3] @ R.T @ truth[n][:3, :3].T) - 1) / 2 for n in names]
     return float(np.sqrt((off**2).mean()) / spread), float(np.degrees(np.arccos(np.clip(min(cosines), -1, 1)))), R
@@ -83,19 +74,6 @@ def test_the_capture_has_the_files_that_training_reads(room: Room) -> None:
     image = read_image(room.capture / "poses.png")
     assert image.shape[0] > 300
     assert (np.ptp(image.astype(int), axis=2) > 60).sum() > 500  # red cameras
-
-
-def test_an_existing_capture_is_replaced_with_overwrite_only(
-    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "room"
-    shutil.copytree(room.capture, out)
-    assert poses(room.photos, out, "--quiet") == 2
-    assert "--overwrite" in one_line(capsys.readouterr().err)
-    (out / "masks").mkdir()
-    assert poses(room.photos, out, "--overwrite", "--quiet") == 2
-    assert "holds other files (masks)" in one_line(capsys.readouterr().err)
-    assert poses_of(out).keys() == room.cameras.keys()
 
 
 def test_separate_models_and_unplaced_photographs_are_reported(

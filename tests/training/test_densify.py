@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from gs2d.config.recipe import GradDensify
-from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
 from gs2d.kernels.torch_kernels import accumulate
@@ -198,10 +197,3 @@ def test_limiting_opacity_zeroes_its_moments_but_not_the_step_count() -> None:
     assert not state.moments["opacity_logits"].square.any()
     assert state.moments["opacity_logits"].steps == 5
     assert state.moments["means"].mean.all()
-
-
-def test_screen_size_never_prunes() -> None:
-    """The official screen-size prune is dead code: splats that are large only on screen are kept."""
-    state = state_of([(0.09, 0.09)], [0.5], [0.0], [1.0])
-    assert run(state, iteration=14_900) == DensifyCounts(0, 0, 0, 0)
-    assert isinstance(state.splats, Splats)

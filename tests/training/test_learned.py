@@ -19,8 +19,9 @@ from gs2d.errors import DivergedError, RecipeError, RunError
 from gs2d.training.learned.camera_pose import CameraPose
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer, TrainerOptions
+from gs2d.training.trainer import Trainer
 from learned_rows import Learner, begun
+from saved_states import resumed_everywhere
 from train_toys import backends, random_splats, same, short
 
 NAMES = ("intrinsics", "poses", "exposure")
@@ -79,25 +80,7 @@ def test_a_cancelled_update_changes_nothing(scene: Scene, name: str) -> None:
 
 
 def test_resuming_from_any_event_gives_the_same_splats_and_rows(scene: Scene) -> None:
-    kept: list[dict[str, object]] = []
-    recipe, backend = everything(), backends()[-1]
-    trainer = Trainer(
-        scene,
-        recipe,
-        GENERIC,
-        backend=backend,
-        on_event=lambda _: kept.append(trainer.state.state_dict()),
-        options=TrainerOptions(progress_every=1),
-    )
-    end = trainer.run()
-    found = trainer.state.learned
-    assert all(rows.values.abs().max() > 1e-4 for rows in found.values())
-    for data in kept[:: 3 if backend == "cpu" else 9]:
-        resumed = Trainer(scene, recipe, GENERIC, backend=backend, state=TrainState.from_state_dict(data))
-        assert same(resumed.run(), end)
-        for name, rows in resumed.state.learned.items():
-            assert torch.equal(rows.values, found[name].values), name
-            assert rows.steps == found[name].steps
+    resumed_everywhere(scene, everything(), backends()[-1], every=3 if backends()[-1] == "cpu" else 9)
 
 
 def test_bytes_do_not_depend_on_the_number_of_threads(scene: Scene) -> None:

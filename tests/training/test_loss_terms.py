@@ -17,8 +17,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training import objective
 from gs2d.training.trainer import Trainer
-from saved_states import reload, saved
-from train_toys import same, short
+from train_toys import short
 
 
 def with_terms(recipe: Recipe, **changes: Any) -> Recipe:
@@ -77,17 +76,6 @@ def test_inputs_of_an_inactive_term_are_not_rendered(scene: Scene, monkeypatch: 
         trainer._whole.evaluate(trainer.state, recipe.stages[0], iteration, 0)
         counts.append((len(rendered), rendered[0].with_distortion))
     assert counts == [(1, False), (1, True)]
-
-
-def test_a_training_with_options_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
-    said = {"options": {"where": "object", "edges": "camera"}}
-    recipe, made = with_terms(short(), normal_consistency=said), cut_out(scene)
-    end = Trainer(made, recipe, GENERIC, backend=backend).run()
-    assert not same(end, Trainer(made, short(), GENERIC, backend=backend).run())
-    trainer = entered(made, recipe, backend)
-    for _ in range(7):
-        trainer.step()
-    assert same(Trainer(made, recipe, GENERIC, backend=backend, state=reload(saved(trainer))).run(), end)
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])

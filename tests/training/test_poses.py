@@ -102,21 +102,6 @@ def test_the_pose_gradient_is_that_of_the_loss(scene: Scene) -> None:
 
 
 # -- training -----------------------------------------------------------------------------------------------------
-def test_cameras_are_constant_while_only_colours_learn(scene: Scene) -> None:
-    trainer = Trainer(scene, quick(), GENERIC, backend=backends()[-1])
-    kept = {}
-    trainer._on_event = lambda event: (
-        kept.setdefault((type(event).__name__, event.stage), trainer.state.learned["poses"].values.clone())
-        if hasattr(event, "stage")
-        else None
-    )  # type: ignore[union-attr]
-    trainer.run()
-    assert kept["StageStarted", "surface"].abs().max() == 0
-    assert kept["StageFinished", "surface"].abs().max() > 1e-3
-    assert torch.equal(kept["StageStarted", "appearance"], kept["StageFinished", "appearance"])
-    assert not torch.equal(kept["StageStarted", "refine"], kept["StageFinished", "refine"])
-
-
 @needs_cpu
 def test_cached_views_use_the_learned_cameras(scene: Scene) -> None:
     learned = Recipe(

@@ -39,34 +39,6 @@ def test_resuming_from_any_event_gives_the_same_bytes(scene: Scene, absgs: bool)
         assert same(resumed.run(), end), event
 
 
-class Killed(Exception):
-    pass
-
-
-@pytest.mark.parametrize("when", [1, 9, 20, 26])
-def test_a_run_that_is_killed_in_an_event_resumes_from_its_last_save_to_the_same_bytes(
-    scene: Scene, backend: str, when: int
-) -> None:
-    end = Trainer(scene, short(), GENERIC, backend=backend, options=TrainerOptions(progress_every=1)).run()
-    saves: list[bytes] = []
-
-    def on_event(event: events.TrainingEvent) -> None:
-        if isinstance(event, events.Progress) and event.iteration % 3 == 0:
-            saves.append(saved(trainer))
-        seen.append(event)
-        if len(seen) == when:
-            raise Killed
-
-    seen: list[events.TrainingEvent] = []
-    trainer = Trainer(
-        scene, short(), GENERIC, backend=backend, on_event=on_event, options=TrainerOptions(progress_every=1)
-    )
-    with pytest.raises(Killed):
-        trainer.run()
-    state = reload(saves[-1]) if saves else None
-    assert same(Trainer(scene, short(), GENERIC, backend=backend, state=state).run(), end)
-
-
 def test_a_finished_stage_can_be_shared_with_a_recipe_of_the_same_first_stage(scene: Scene) -> None:
     first = short().stages[0]
     longer = Recipe("longer", (first, replace(continue_training(), iterations=4)))

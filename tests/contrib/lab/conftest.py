@@ -1,14 +1,16 @@
-"""What tests of the cluster share."""
+"""What tests of blocks and of the cluster share."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from fake_ray import FakeQueue, FakeRay
+from flown import write_tiny_flight
 from gs2d.contrib.lab import cluster as module
 from gs2d.contrib.lab import cluster_task
 from room_photos import Room, found_room
@@ -34,3 +36,9 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
     """Twelve photographs of a room, and their cameras."""
     pytest.importorskip("pycolmap")
     return found_room(tmp_path_factory.mktemp("room"))
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny flight, which tests must not change."""
+    return write_tiny_flight(tmp_path_factory.mktemp("flight") / "capture")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from benchmarks.flight import Flight, write_flight
 
-from flown import CHANGES, PARTITION, digest, tiny_blocks, write_tiny_flight
+from flown import CHANGES, PARTITION, digest, tiny_blocks
 from gs2d.contrib.lab import blocks as module
 from gs2d.contrib.lab.block_start import FROZEN, OWN, read_start
 from gs2d.contrib.lab.blocks import blocks
@@ -22,11 +22,6 @@ from gs2d.errors import DataError, Gs2dError, RecipeError, RunError
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.training.events import Event
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny_flight(tmp_path_factory.mktemp("flight") / "capture")
 
 
 @pytest.fixture(scope="module")

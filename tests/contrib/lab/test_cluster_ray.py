@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flown import digest, tiny_blocks, write_tiny_flight
+from flown import digest, tiny_blocks
 from gs2d.contrib.lab.blocks import blocks
 from ray_commands import begin, blocks_words, cluster_of, lose, read_until
 
@@ -26,11 +26,6 @@ def nodes() -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A head without CPUs and two nodes with one each; the program, and the address."""
     with cluster_of(2) as started:
         yield started
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny_flight(tmp_path_factory.mktemp("flight") / "capture")
 
 
 @pytest.fixture(scope="module")

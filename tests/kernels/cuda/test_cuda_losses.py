@@ -12,7 +12,7 @@ import emulate
 from gs2d.kernels.cuda.cuda_losses import CudaLosses
 from gs2d.kernels.loss_operations import NormalOptions
 from gs2d.losses import formulas as reference
-from loss_images import geometry, photographs, relative_error, wide_camera
+from loss_images import CONSISTENCIES, geometry, photographs, relative_error, wide_camera
 
 # Smaller than the window; a single row; just over one strip of 128 reals (43 pixels) or 32 rows.
 SIZES = [(1, 1), (5, 3), (37, 44), (33, 20)]
@@ -52,16 +52,7 @@ def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emul
     assert not gradient.any()
 
 
-@pytest.mark.parametrize(
-    ("edges", "weighted", "per_splat", "masked"),  # each pair of values occurs at least once
-    [
-        ("undefined", False, False, True),
-        ("undefined", True, True, False),
-        ("undefined", True, False, True),
-        ("camera", False, False, False),
-        ("camera", False, True, True),
-    ],
-)
+@pytest.mark.parametrize(("edges", "weighted", "per_splat", "masked"), CONSISTENCIES)
 @pytest.mark.parametrize("size", [*SIZES, (9, 33)])
 def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     emulator: emulate.Emulator, size: tuple[int, int], per_splat: bool, masked: bool, edges: str, weighted: bool
