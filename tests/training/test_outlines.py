@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
-from gs2d.core.camera import look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.training.robust.outlines import moved_outward
 from gs2d.training.robust.view_cells import ViewCells
 
 SIZE, CELLS, INSIDE = 192, 48, 0.95
 
 
-def cameras():
+def cameras() -> Iterator[Camera]:
     """Twenty-four cameras around the origin, at a distance of 5."""
     ring = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     for height in (-3.0, 0.0, 3.0):
@@ -21,19 +23,19 @@ def cameras():
             yield look_at(np.array(eye), np.zeros(3), np.array([0, 0, 1.0]), width=SIZE, height=SIZE, fx=300.0)
 
 
-def directions(count):
+def directions(count: int) -> np.ndarray:
     """Return unit vectors [N, 3]."""
     vectors = np.random.default_rng(0).normal(size=(count, 3))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def pixel_rays(camera):
+def pixel_rays(camera: Camera) -> np.ndarray:
     """Return the points [SIZE, SIZE, 3] at depth 1 in the frame of a camera."""
     rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
     return np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
 
 
-def ball(camera, shine):
+def ball(camera: Camera, shine: float) -> ViewCells:
     """A view of a ball of radius 1 before a wall; where it mirrors, its depth is too large."""
     rays = pixel_rays(camera)
     center = camera.T_cam_world[:3, 3]
@@ -46,7 +48,7 @@ def ball(camera, shine):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_shiny_splats_move_to_the_outlines(sign):
+def test_shiny_splats_move_to_the_outlines(sign: int) -> None:
     out = directions(300)
     moved = moved_outward(INSIDE * out, sign * out, [ball(camera, 0.5) for camera in cameras()])
     radius = np.linalg.norm(moved, axis=1)
@@ -55,13 +57,13 @@ def test_shiny_splats_move_to_the_outlines(sign):
     assert radius.max() < 1.02
 
 
-def test_matt_splats_stay():
+def test_matt_splats_stay() -> None:
     out = directions(50)
     views = [ball(camera, 0.05) for camera in cameras()]
     np.testing.assert_array_equal(moved_outward(INSIDE * out, out, views), INSIDE * out)
 
 
-def test_shiny_plane_stays():
+def test_shiny_plane_stays() -> None:
     """A flat surface has no outline inside its image, so views only see past what has left it."""
     views = [
         ViewCells(camera, np.ones((CELLS, CELLS)), plane_depth(camera))
@@ -72,13 +74,13 @@ def test_shiny_plane_stays():
     np.testing.assert_array_equal(moved_outward(places, np.tile([0, 0, 1.0], (50, 1)), views), places)
 
 
-def plane_depth(camera):
+def plane_depth(camera: Camera) -> np.ndarray:
     """Return the depth [SIZE, SIZE] of the plane z = 0."""
     down = (pixel_rays(camera) @ camera.rotation)[..., 2]
     return np.where(down < 0, -camera.center[2] / np.minimum(down, -1e-9), 0.0)
 
 
-def test_hollows_stay():
+def test_hollows_stay() -> None:
     """No outline shows the inside of a bowl, and views see past what leaves it."""
     inside = -directions(300)
     inside[:, 2] = -np.abs(inside[:, 2])  # the lower half, seen from above
@@ -87,7 +89,7 @@ def test_hollows_stay():
     np.testing.assert_array_equal(moved_outward(inside, -inside, bowl), inside)
 
 
-def far_side(camera):
+def far_side(camera: Camera) -> np.ndarray:
     """Return the depth of the lower half of the ball, seen from inside, before a wall."""
     rays = pixel_rays(camera)
     center = camera.T_cam_world[:3, 3]

@@ -66,9 +66,10 @@ def _bulges(places: np.ndarray, outward: np.ndarray, reach: float) -> np.ndarray
     """Return where a surface is convex, bool [M], by points on it [M, 3] and its normals: its neighbours lie lower."""
     cells = np.floor(places / (reach / CELLS_IN_REACH)).astype(np.int64)
     some = np.unique(cells, axis=0, return_index=True)[1]
-    distance, near = cKDTree(places[some]).query(places, k=min(NEIGHBOURS, len(some)), distance_upper_bound=reach)
-    weight = np.isfinite(distance.reshape(len(places), -1))
-    near = some[np.where(weight, near.reshape(len(places), -1), 0)]
+    count = np.arange(1, min(NEIGHBOURS, len(some)) + 1)
+    distance, near = map(np.asarray, cKDTree(places[some]).query(places, k=count, distance_upper_bound=reach))
+    weight = np.isfinite(distance)
+    near = some[np.where(weight, near, 0)]
     weight &= np.einsum("ma,mka->mk", outward, outward[near]) > 0  # the other side of a thin wall faces away
     height = np.einsum("ma,mka->mk", outward, places[near] - places[:, None])
     return np.asarray((weight * height).sum(axis=1) < 0)
