@@ -27,6 +27,7 @@ LEAST_PAST = 3  # views that see past it: fewer may be wrong
 STEP, STEPS = 0.0025, 12  # fraction of the depth; what would have to move farther is hollow, as a bowl is
 REACH, CELLS_IN_REACH, NEIGHBOURS = 0.06, 4, 96
 """Of a neighbourhood: fraction of the median depth; it is thinned to one point in a cell, as many to its radius."""
+ROWS_AT_ONCE = 1 << 14  # their neighbours take 100 MB
 MOST_VIEWS = 48  # that are compared, evenly chosen
 
 
@@ -66,13 +67,16 @@ def _bulges(places: np.ndarray, outward: np.ndarray, reach: float) -> np.ndarray
     """Return where a surface is convex, bool [M], by points on it [M, 3] and its normals: its neighbours lie lower."""
     cells = np.floor(places / (reach / CELLS_IN_REACH)).astype(np.int64)
     some = np.unique(cells, axis=0, return_index=True)[1]
-    count = np.arange(1, min(NEIGHBOURS, len(some)) + 1)
-    distance, near = map(np.asarray, cKDTree(places[some]).query(places, k=count, distance_upper_bound=reach))
-    weight = np.isfinite(distance)
-    near = some[np.where(weight, near, 0)]
-    weight &= np.einsum("ma,mka->mk", outward, outward[near]) > 0  # the other side of a thin wall faces away
-    height = np.einsum("ma,mka->mk", outward, places[near] - places[:, None])
-    return np.asarray((weight * height).sum(axis=1) < 0)
+    tree, count = cKDTree(places[some]), np.arange(1, min(NEIGHBOURS, len(some)) + 1)
+    convex = np.zeros(len(places), bool)
+    for rows in np.array_split(np.arange(len(places)), len(places) // ROWS_AT_ONCE + 1):
+        distance, near = map(np.asarray, tree.query(places[rows], k=count, distance_upper_bound=reach))
+        weight = np.isfinite(distance)
+        near = some[np.where(weight, near, 0)]
+        weight &= np.einsum("ma,mka->mk", outward[rows], outward[near]) > 0  # the other side of a thin wall faces away
+        height = np.einsum("ma,mka->mk", outward[rows], places[near] - places[rows, None])
+        convex[rows] = (weight * height).sum(axis=1) < 0
+    return convex
 
 
 def _steps(places: np.ndarray, step: np.ndarray, views: Sequence[ViewCells]) -> np.ndarray:
