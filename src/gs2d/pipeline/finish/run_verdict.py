@@ -208,7 +208,7 @@ def _quality(measures: Measures) -> list[Finding]:
     if grade != GOOD and trained is not None and trained - psnr <= grades.OVERFIT:
         advice = _train_longer(trained)
     elif grade != GOOD or grades.NEW_VIEWS.grade(low) == POOR:
-        advice = f"Take more photographs of what {name} shows; longer training will not help there."
+        advice = f"Take more photographs from viewpoints near {name}. Longer training does not improve it."
     figure = f"{psnr:.1f} dB" + (f", worst {low:.1f} dB" if len(test) > 1 else "")
     text = f"Mean PSNR of {len(test)} held-out photograph{'s' * (len(test) > 1)}; {name} is the worst."
     return [Finding("new views", grade, figure, text, advice, (name,))]

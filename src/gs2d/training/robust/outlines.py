@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
+from gs2d.core.image_arrays import enlarged
 from gs2d.training.robust.view_cells import ViewCells
 
 WINDOW = 13  # cells, of the mean of a map: shiny things have spots that look matt
@@ -44,10 +45,11 @@ def moved_outward(means: np.ndarray, normals: np.ndarray, views: Sequence[ViewCe
     moved, count = means.astype(np.float64), len(means)
     shine, depth, seen, towards = (np.zeros((count, *shape)) for shape in ((), (), (), (3,)))
     for view in views:
-        rows, z, there = _shown(view, moved)
-        visible = np.abs(there - z) <= SEEN * z
+        rows, z, at = _shown(view, moved)
+        visible = np.abs(view.depth[at] - z) <= SEEN * z
         rows, z = rows[visible], z[visible]
-        shine[rows] += _at(view, uniform_filter(view.values, WINDOW, mode="nearest"), moved[rows])
+        smooth = uniform_filter(view.values, WINDOW, mode="nearest")
+        shine[rows] += enlarged(smooth, *view.depth.shape)[at][visible]
         depth[rows] += z
         seen[rows] += 1
         ray = view.camera.center - moved[rows]
@@ -63,49 +65,42 @@ def moved_outward(means: np.ndarray, normals: np.ndarray, views: Sequence[ViewCe
     return moved
 
 
-def _bulges(places: np.ndarray, outward: np.ndarray, reach: float) -> np.ndarray:
+def _bulges(positions: np.ndarray, outward: np.ndarray, reach: float) -> np.ndarray:
     """Return where a surface is convex, bool [M], by points on it [M, 3] and its normals: its neighbours lie lower."""
-    cells = np.floor(places / (reach / CELLS_IN_REACH)).astype(np.int64)
+    cells = np.floor(positions / (reach / CELLS_IN_REACH)).astype(np.int64)
     some = np.unique(cells, axis=0, return_index=True)[1]
-    tree, count = cKDTree(places[some]), np.arange(1, min(NEIGHBOURS, len(some)) + 1)
-    convex = np.zeros(len(places), bool)
-    for rows in np.array_split(np.arange(len(places)), len(places) // ROWS_AT_ONCE + 1):
-        distance, near = map(np.asarray, tree.query(places[rows], k=count, distance_upper_bound=reach))
+    tree, count = cKDTree(positions[some]), np.arange(1, min(NEIGHBOURS, len(some)) + 1)
+    convex = np.zeros(len(positions), bool)
+    for rows in np.array_split(np.arange(len(positions)), len(positions) // ROWS_AT_ONCE + 1):
+        distance, near = map(np.asarray, tree.query(positions[rows], k=count, distance_upper_bound=reach))
         weight = np.isfinite(distance)
         near = some[np.where(weight, near, 0)]
         weight &= np.einsum("ma,mka->mk", outward[rows], outward[near]) > 0  # the other side of a thin wall faces away
-        height = np.einsum("ma,mka->mk", outward[rows], places[near] - places[rows, None])
+        height = np.einsum("ma,mka->mk", outward[rows], positions[near] - positions[rows, None])
         convex[rows] = (weight * height).sum(axis=1) < 0
     return convex
 
 
-def _steps(places: np.ndarray, step: np.ndarray, views: Sequence[ViewCells]) -> np.ndarray:
-    """Return the number of steps [M] that places [M, 3] take before views see past them; 0 if none do."""
-    steps, waiting = np.zeros(len(places)), np.arange(len(places))
+def _steps(positions: np.ndarray, step: np.ndarray, views: Sequence[ViewCells]) -> np.ndarray:
+    """Return the number of steps [M] that positions [M, 3] take before views see past them; 0 if none do."""
+    steps, waiting = np.zeros(len(positions)), np.arange(len(positions))
     for taken in range(STEPS + 1):
         past, far = np.zeros((2, len(waiting)), np.int64)
-        now = places[waiting] + taken * step[waiting]
+        now = positions[waiting] + taken * step[waiting]
         for view in views:
-            rows, z, there = _shown(view, now)
-            past[rows] += there > (1 + PAST) * z
-            far[rows] += there > (1 + FAR) * z
+            rows, z, at = _shown(view, now)
+            past[rows] += view.depth[at] > (1 + PAST) * z
+            far[rows] += view.depth[at] > (1 + FAR) * z
         stops = past >= LEAST_PAST
         steps[waiting[stops & (far >= LEAST_PAST)]] = max(taken - 1, 0)
         waiting = waiting[~stops]
     return steps
 
 
-def _shown(view: ViewCells, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which places [M, 3] are inside an image, their depths, and the depths that the view has there."""
-    pixels, z = view.camera.project(places)
+def _shown(view: ViewCells, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return which positions [M, 3] are inside an image, their depths, and the rows and columns of their pixels."""
+    pixels, z = view.camera.project(positions)
     inside = (z > 0) & (pixels >= 0).all(axis=1) & (pixels < (view.camera.width, view.camera.height)).all(axis=1)
     rows = np.flatnonzero(inside)
     column, row = pixels[rows].astype(np.int64).T
-    return rows, z[rows], view.depth[row, column]
-
-
-def _at(view: ViewCells, cells: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the values [M] of cells [S, S] at places [M, 3] inside the image of a view."""
-    pixels = view.camera.project(places)[0]
-    column, row = (pixels / (view.camera.width, view.camera.height) * len(cells)).astype(np.int64).T
-    return np.asarray(cells[row, column])
+    return rows, z[rows], (row, column)

@@ -277,7 +277,8 @@ class Robustness:
     def _to_outlines(self, state: TrainState) -> Tensor:
         """Return the centres [N, 3] of the splats after those on shiny surface have moved outward."""
         splats, views = state.splats, []
-        for row in range(0, len(self._images), -(-len(self._images) // outlines.MOST_VIEWS)):
+        mapped = [row for row, others in enumerate(self._neighbours) if others]  # the others have empty maps
+        for row in mapped[:: max(1, -(-len(mapped) // outlines.MOST_VIEWS))]:
             camera, _, depth = self._rendered(state, row)
             views.append(ViewCells(camera, state.maps["shine"][row].cpu().numpy() / 255.0, depth))
         normals = quats_to_matrices(splats.quats)[:, :, 2]
