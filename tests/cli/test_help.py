@@ -113,6 +113,19 @@ def test_every_option_is_parsed_and_fills_its_field() -> None:
     assert "--no-refine" in {flag for option in options_of(NAMES["mesh"]) for flag in option.flags}
 
 
+def test_options_have_the_same_defaults_in_every_command() -> None:
+    """But for --out, --format of `export` and --schedule-scale of `sweep`, which has no --quality."""
+    defaults: dict[str, set[object]] = {}
+    for name, command in NAMES.items():
+        for option in options_of(command):
+            if option.flags and option.field != "out" and (name, option.name) not in DIFFERENT:
+                defaults.setdefault(option.name, set()).add(option.default)
+    assert {name: values for name, values in defaults.items() if len(values) > 1} == {}
+
+
+DIFFERENT = {("export", "--format"), ("sweep", "--schedule-scale")}
+
+
 def written(option: Option) -> list[str]:
     """An option with a value that is not its default, in words."""
     value = option.choices[-1] if option.choices else "-1.5e-1" if option.kind is float else "97"

@@ -40,7 +40,7 @@ from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run
 from gs2d.pipeline.prepare.learned_views import with_learned_appearance
 from gs2d.pipeline.prepare.limits import use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, difference, finished_splats
-from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
+from gs2d.pipeline.prepare.options import CommonTraining, Effort, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Notice, OnEvent, ignore
@@ -236,6 +236,8 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     begun = (options.out / BLOCKS_JSON).exists()
     if not begun and is_run(options.out):  # without blocks
         return _one_training(options, training, on_event)
+    if begun and training.downscale is None:
+        training = replace(training, downscale=settled_of(options.out).get("downscale"))
     settled = settle(training, on_event)
     if not partition.grid and begun:
         saved = settled_of(options.out)["partition"]
@@ -251,6 +253,8 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     definition = definition_of(settled, training, partition)
     if begun:
         check_same_definition(options.out, definition)
+    settings = settled.resolved
+    training = replace(training, downscale=settings.downscale, schedule_scale=settings.schedule_scale)
     tasks = tasks_of(replace(training, recipe="", overrides=(), resume=True), partition, share)
 
     def write() -> None:
@@ -283,13 +287,12 @@ def training_of(options: BlocksOptions) -> TrainOptions:
         out=options.out,
         format=options.format,
         masks=options.masks,
-        downscale=options.downscale,
-        schedule_scale=options.schedule_scale,
         backend=options.backend,
         seed=options.seed,
         threads=options.threads,
         resume=True,
         memory=options.memory,
+        **values(Effort, options),
         **(values(CommonTraining, options) | {"overrides": options.recipe_changes}),
     )
 

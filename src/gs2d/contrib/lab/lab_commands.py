@@ -14,7 +14,7 @@ _ACTIONS = "gs2d.contrib.lab.show_table"
     "blocks",
     action=f"{_ACTIONS}:show_blocks",
     group=STEPS,
-    first=("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
+    first=("scene", "out", "blocks", "quality", "recipe", "downscale", "memory", "slots"),
 )
 @dataclass(frozen=True, kw_only=True)
 class BlocksCommand(BlocksOptions, Common):

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from gs2d.config.arguments import SETTING, Arg
 from gs2d.errors import RecipeError
-from gs2d.pipeline.prepare.options import CommonTraining, Options, Overrides, Resources
+from gs2d.pipeline.prepare.options import CommonTraining, Effort, Options, Overrides, Resources
 
 _PARTITION = "partition."  # prefix of changes of the partition in --set
 SWEEP = "sweep"  # the name of a table of chosen recipes
@@ -34,7 +34,7 @@ class SweepOptions(Options):
     downscale: int | None = None
     """Shrink the photographs by this integer factor (default: by protocol)."""
     schedule_scale: float = 1.0
-    """Fraction of the iterations of the recipe."""
+    """Fraction of the iterations of the recipe (default: 1, as for known data sets in `gs2d train`)."""
     seeds: Annotated[tuple[int, ...], Arg(kind=str)] = (0,)
     """Seeds, such as 0,1,2, or a count: 3 means 0,1,2."""
     backend: str = "auto"
@@ -89,7 +89,7 @@ def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlocksOptions(CommonTraining, Resources):
+class BlocksOptions(CommonTraining, Resources, Effort):
     """Options of `gs2d blocks`."""
 
     scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
@@ -107,10 +107,6 @@ class BlocksOptions(CommonTraining, Resources):
     """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
     format: str = "auto"
     """Capture format: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one from a package."""
-    downscale: int = 1
-    """Shrink the photographs by this integer factor."""
-    schedule_scale: float = 1.0
-    """Fraction of the iterations of the recipe, for each block."""
     backend: str = "auto"
     """Rasterizer: auto (the fastest here), cpu, cuda or reference. `gs2d doctor` lists them."""
     seed: int = 0

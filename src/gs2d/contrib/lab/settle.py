@@ -27,7 +27,7 @@ from gs2d.pipeline.prepare.estimate import Estimate, estimate, expected_splats, 
 from gs2d.pipeline.prepare.loaded import LoadedRun, loaded_run
 from gs2d.pipeline.prepare.open_capture import open_capture
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.resolve import resolve
+from gs2d.pipeline.prepare.resolve import resolve, schedule_scale_of
 from gs2d.training.events import Notice, OnEvent
 
 FORMAT = 1
@@ -55,8 +55,8 @@ def settle(options: TrainOptions, on_event: OnEvent, recipe: Recipe | None = Non
 
     With a resolved ``recipe``, the protocol of the options is resolved, too. Nothing is written.
     """
-    opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
-    scale = 1.0 if options.schedule_scale is None else options.schedule_scale
+    opened = open_capture(options, on_event)
+    scale = schedule_scale_of(options, opened)
     if recipe is None:
         recipe, resolved = resolve(options, opened, on_event, seed=options.seed, schedule_scale=scale)
         if recipe.learns("poses"):
