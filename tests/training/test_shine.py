@@ -19,10 +19,7 @@ from gs2d.kernels.library import ready_library
 from gs2d.meshing.warped_ncc import GreyImage
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.training.robust import outlines
-from gs2d.training.robust.robustness import COMPARED
 from gs2d.training.robust.shine import CELLS, shine_maps
-from gs2d.training.robust.view_cells import ViewCells
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
 from saved_states import resumed_everywhere
@@ -103,23 +100,6 @@ def test_training_finds_shine_and_resumes_with_it() -> None:
     trainer.run()
     assert trainer.state.maps["shine"].float().mean() > 20
     resumed_everywhere(scene, recipe, "cpu", every=4)
-
-
-def test_shiny_splats_move_in_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-
-    def raised(means: np.ndarray, normals: np.ndarray, views: Sequence[ViewCells]) -> np.ndarray:
-        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
-        seen.append((len(views), max(float(view.values.max()) for view in views), means))
-        return means - np.array((0.0, 0.0, 0.2))
-
-    monkeypatch.setattr(outlines, "moved_outward", raised)
-    trainer = Trainer(with_reflection(wall()), robust(), GENERIC, backend="cpu", init=flat_wall())
-    trainer.run()
-    assert [count for count, _, _ in seen] == [5] * len(COMPARED)
-    assert all(0.1 < shine <= 1.0 for _, shine, _ in seen)
-    heights = [float(np.median(means[:, 2])) for _, _, means in seen]
-    assert np.diff(heights) == pytest.approx(-0.2, abs=0.05)
 
 
 def test_frozen_splats_show_the_surface_too() -> None:

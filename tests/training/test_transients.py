@@ -14,7 +14,7 @@ from gs2d.core.image_arrays import at_cells, enlarged
 from gs2d.data.scene import Scene, View
 from gs2d.errors import RunError
 from gs2d.io.run_dir import TRANSIENTS, RunFolder
-from gs2d.pipeline.prepare.learned_views import with_transients, write_transients
+from gs2d.pipeline.prepare.learned_views import with_maps, write_maps
 from gs2d.training.events import Notice, TrainingEvent
 from gs2d.training.robust.transients import CELLS, transient_maps
 from gs2d.training.robust.view_cells import ViewCells
@@ -112,17 +112,17 @@ def test_the_masks_of_a_run_are_written_and_read(tmp_path: Path) -> None:
     cells = np.zeros((CELLS, CELLS), bool)
     cells[BLOCK] = True
     scene = wall()
-    marked = replace(scene, train=(scene.train[0], scene.train[1].without(cells), *scene.train[2:]))
-    write_transients(RunFolder(tmp_path), marked, told.append)
+    marked = replace(scene, train=(scene.train[0], scene.train[1].with_cells(transient=cells), *scene.train[2:]))
+    write_maps(RunFolder(tmp_path), marked, told.append)
     assert isinstance(told[0], Notice)
     assert "1 of 5 photographs" in told[0].text
     assert sorted(path.name for path in (tmp_path / TRANSIENTS).iterdir()) == ["1.png.png"]
-    again = with_transients(RunFolder(tmp_path), scene)
+    again = with_maps(RunFolder(tmp_path), scene)
     assert np.array_equal(again.train[1].transient, cells)
     assert again.train[0].mask() is None
-    write_transients(RunFolder(tmp_path), scene, told.append)  # a later training without any
+    write_maps(RunFolder(tmp_path), scene, told.append)  # a later training without any
     assert not (tmp_path / TRANSIENTS).exists()
-    assert with_transients(RunFolder(tmp_path), scene) is scene
+    assert with_maps(RunFolder(tmp_path), scene) is scene
 
 
 def test_cells_and_images() -> None:
@@ -137,12 +137,14 @@ def test_the_mask_of_a_view_and_its_cells_are_joined() -> None:
     own = np.ones((HEIGHT, WIDTH), bool)
     own[0] = False
     cells[:, : CELLS // 2] = True
-    mask = View.from_arrays(view.name, view.camera, view.image(), own).without(cells).mask()
+    mask = View.from_arrays(view.name, view.camera, view.image(), own).with_cells(transient=cells).mask()
     assert mask is not None
     assert not mask[0].any()
     assert not mask[:, : WIDTH // 2].any()
     assert mask[1:, WIDTH // 2 :].all()
-    kept = view.without(cells).usable(masks=False)  # protocols that ignore the user's masks leave them out, too
+    kept = view.with_cells(transient=cells).usable(
+        masks=False
+    )  # protocols that ignore the user's masks leave them out, too
     assert kept is not None
     assert kept[:, WIDTH // 2 :].all()
     assert not kept[:, : WIDTH // 2].any()

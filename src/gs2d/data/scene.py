@@ -40,7 +40,10 @@ class View:
     zoom: Zoom | None = None  # learned change of the intrinsics of ``camera``; None: unchanged
     # Learned parameters of how the image shows the colours of the scene (``gs2d.training.learned``).
     appearance: Appearance = field(default_factory=dict)
-    transient: np.ndarray | None = None  # [S, S] bool: cells that show what no other image shows, and do not count
+    # Maps of training, in cells [S, S]: transient (bool) is what no other image shows, and does not count; shine
+    # (uint8) is 0 on matt surface, 255 on shiny surface.
+    transient: np.ndarray | None = None
+    shine: np.ndarray | None = None
     is_face: bool = False  # whether it was cut out of a panorama or a wide fisheye (``data/faces.py``)
 
     @classmethod
@@ -64,9 +67,10 @@ class View:
         camera = replace(self.camera, T_cam_world=T_cam_world)
         return self._sharing(camera=camera) if zoom is None else self._sharing(camera=camera.zoomed(zoom), zoom=zoom)
 
-    def without(self, transient: np.ndarray) -> View:
-        """Return the view whose mask leaves out the cells of ``transient``, bool [S, S]."""
-        return self._sharing(transient=transient) if transient.any() else self
+    def with_cells(self, **maps: np.ndarray) -> View:
+        """Return the view with its ``transient`` or ``shine``, unless they are 0 everywhere."""
+        found = {name: cells for name, cells in maps.items() if cells.any()}
+        return self._sharing(**found) if found else self
 
     def with_appearance(self, appearance: Appearance) -> View:
         """Return the view with further appearance parameters."""

@@ -50,7 +50,8 @@ from gs2d.errors import DataError, DiskError, RunError
 from gs2d.io.run_schema import DEFINITION_SHAPE, METRICS_SHAPE, check_shape
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
-CHECKPOINTS, RENDERS, SURFACE, EDITS, TRANSIENTS = "checkpoints", "renders", "surface", "edits", "transients"
+CHECKPOINTS, RENDERS, SURFACE, EDITS = "checkpoints", "renders", "surface", "edits"
+TRANSIENTS, SHINE = "transients", "shine"  # maps of training
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
 POSES, LEARNED, SUBJECT, VERDICT = "poses.json", "learned.json", "subject.json", "verdict.json"
 GEOREFERENCE = "georeference.json"
@@ -268,7 +269,7 @@ class RunFolder:
 
     def clear(self) -> None:
         """Delete the files of the run only; ``run.json`` last, so that an interrupted call can be repeated."""
-        for name in (CHECKPOINTS, RENDERS, SURFACE, EDITS, TRANSIENTS):
+        for name in (CHECKPOINTS, RENDERS, SURFACE, EDITS, TRANSIENTS, SHINE):
             shutil.rmtree(self.file(name), ignore_errors=True)
         results = (SPLATS, SUBJECT, VERDICT, GEOREFERENCE, MESH, TEXTURED, REPORT, PAGE)
         for name in (EVENTS, METRICS, POSES, LEARNED, *results, RUN_JSON):

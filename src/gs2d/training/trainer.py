@@ -44,7 +44,7 @@ from gs2d.training.parallel import ONE_PROCESS, ProcessGroup, Turn
 from gs2d.training.resumable import check_resumable
 from gs2d.training.robust.regularise import is_opaque
 from gs2d.training.robust.robustness import Robustness, with_adjusted_cameras
-from gs2d.training.robust.transients import without_transients
+from gs2d.training.robust.transients import with_maps
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
@@ -200,10 +200,10 @@ class Trainer:
 
     def scene_now(self) -> Scene:
         """Return the scene with the learned quantities of its images and cameras, without what single images show."""
-        return without_transients(self.learned.scene_now(self.state.learned), self.state)
+        return with_maps(self.learned.scene_now(self.state.learned), self.state)
 
     def _targets(self) -> TargetSource:
-        scene = without_transients(self.scene, self.state)
+        scene = with_maps(self.scene, self.state)
         return make_targets(scene, self.protocol, self.backend, self.state.splats, self._needs)
 
     @property

@@ -25,9 +25,9 @@ from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import peak_memory, score_views, split_metrics
 from gs2d.pipeline.prepare.learned_views import (
     with_learned_appearance,
-    with_transients,
+    with_maps,
     write_appearance,
-    write_transients,
+    write_maps,
 )
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
@@ -91,7 +91,7 @@ def write_result(settled: LoadedRun, options: TrainOptions, partition: Partition
     run.write_definition({**settled.resolved.to_json(), "partition": partition_json(partition)})
     coarse = open_run(coarse_folder(options.out))
     write_appearance(run, with_learned_appearance(coarse, settled.recipe, settled.scene), on_event)
-    write_transients(run, with_transients(coarse, settled.scene), on_event)
+    write_maps(run, with_maps(coarse, settled.scene), on_event)
     run.events.cut(0)
     write_splats(run.file(SPLATS), splats)
     return len(splats)
@@ -102,7 +102,7 @@ def finish_merged(settled: LoadedRun, options: TrainOptions, on_event: OnEvent) 
     run = RunFolder(options.out)
     if not run.file(SPLATS).exists():
         raise RunError(f"{options.out} must have {SPLATS}, found none; run the command again")
-    scene, splats = with_transients(run, settled.scene), read_splats(run.file(SPLATS)).to(settled.backend.device)
+    scene, splats = with_maps(run, settled.scene), read_splats(run.file(SPLATS)).to(settled.backend.device)
     shown = predicted(settled.trained(splats, with_learned_appearance(run, settled.recipe, scene)))
     entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
     collected = Collector(scene)

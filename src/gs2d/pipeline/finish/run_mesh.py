@@ -36,6 +36,7 @@ from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.texture import ColorSource
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
+from gs2d.meshing.visual_hull import to_visual_hull
 from gs2d.meshing.warped_ncc import GreyImage
 from gs2d.pipeline.finish.run_report import show_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, centers_inside, meshed_subject
@@ -201,7 +202,8 @@ def _extract(trained: Trained, options: MeshOptions, on_event: OnEvent, subject:
         max_bytes=VOLUME_BYTES if budget is None else budget,
         slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
-    frames = _frames(trained, options, on_event)
+    frames, shine = _frames(trained, options, on_event), [view.shine for view in trained.scene.train]
+    frames = to_visual_hull(frames, shine) if any(cells is not None for cells in shine) else frames
     result: Extraction = method.extract(frames, chosen, threads=torch.get_num_threads(), backend=trained.backend)
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface is covered well enough"))

@@ -17,9 +17,9 @@ from gs2d.core.camera import Camera, Zoom
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.transforms import focus_point
 from gs2d.data import Scene, View
-from gs2d.data.image_files import read_mask, write_image
+from gs2d.data.image_files import read_image, read_mask, write_image
 from gs2d.errors import DataError, RunError, ShapeError
-from gs2d.io.run_dir import LEARNED, POSES, SPLATS, TRANSIENTS, RunFolder
+from gs2d.io.run_dir import LEARNED, POSES, SHINE, SPLATS, TRANSIENTS, RunFolder
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.learned_table import numbers_of, shown, unshown
 from gs2d.training.learned.quantity import ImagePoints
@@ -110,19 +110,21 @@ def over(view: View, color: Tensor, background: tuple[float, float, float]) -> t
     return torch.from_numpy(alpha).to(color), torch.tensor(background, dtype=color.dtype, device=color.device)
 
 
-# -- what single photographs show --------------------------------------------------------------------------------------
-def write_transients(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
-    """Write a mask of each photograph with pixels that no other shows, as COLMAP names masks, and report them."""
-    folder = run.file(TRANSIENTS)
-    shutil.rmtree(folder, ignore_errors=True)
-    shares = {view.name: view.transient for view in scene.train if view.transient is not None}
+# -- maps of photographs -----------------------------------------------------------------------------------------------
+def write_maps(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
+    """Write masks of what only one photograph shows, and maps of shiny surface, as COLMAP names masks; report masks."""
+    for name in (TRANSIENTS, SHINE):
+        shutil.rmtree(run.file(name), ignore_errors=True)
+    for view in scene.train:
+        for name, image in ((TRANSIENTS, view.transient), (SHINE, view.shine)):
+            if image is not None:
+                path = run.file(name) / f"{view.name}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_image(path, ~image if name == TRANSIENTS else image)
+    shares = [view.transient for view in scene.train if view.transient is not None]
     if not shares:
         return
-    for name, cells in shares.items():
-        path = folder / f"{name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, ~cells)
-    share = sum(float(cells.mean()) for cells in shares.values()) / len(scene.train)
+    share = sum(float(cells.mean()) for cells in shares) / len(scene.train)
     on_event(
         Notice(
             f"{100 * share:.1f} % of the pixels show what only one photograph shows, such as passers-by, in "
@@ -132,16 +134,20 @@ def write_transients(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
     )
 
 
-def with_transients(run: RunFolder, scene: Scene) -> Scene:
-    """Return a scene whose masks leave out the pixels that training left out.
+def with_maps(run: RunFolder, scene: Scene) -> Scene:
+    """Return a scene with the maps of a run: its masks leave out what training left out.
 
-    Raises DataError if a mask is damaged.
+    Raises DataError if a map is damaged.
     """
-    if not (folder := run.file(TRANSIENTS)).is_dir():
+
+    def mapped(view: View) -> View:
+        transient, shine = (run.file(name) / f"{view.name}.png" for name in (TRANSIENTS, SHINE))
+        view = view.with_cells(transient=~read_mask(transient)) if transient.exists() else view
+        return view.with_cells(shine=read_image(shine)[..., 0]) if shine.exists() else view
+
+    if not any(run.file(name).is_dir() for name in (TRANSIENTS, SHINE)):
         return scene
-    paths = ((view, folder / f"{view.name}.png") for view in scene.train)
-    train = (view.without(~read_mask(path)) if path.exists() else view for view, path in paths)
-    return replace(scene, train=tuple(train))
+    return replace(scene, train=tuple(map(mapped, scene.train)))
 
 
 # -- cameras -----------------------------------------------------------------------------------------------------------

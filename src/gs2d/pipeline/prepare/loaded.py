@@ -28,7 +28,7 @@ from gs2d.io.formats.splat_formats import read_surfels
 from gs2d.io.run_dir import RUN_JSON, SPLATS, RunFolder, open_run, versions
 from gs2d.losses.prior_formulas import NormalTarget
 from gs2d.losses.priors import DepthPlan, Priors
-from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_refined_poses, with_transients
+from gs2d.pipeline.prepare.learned_views import with_learned_appearance, with_maps, with_refined_poses
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import OpenCapture, capture_in_memory, open_capture, read_scene
 from gs2d.pipeline.prepare.options import TrainOptions, values
@@ -311,7 +311,7 @@ def reload_run(run: RunFolder, on_event: OnEvent) -> LoadedRun:
             f"{record.train} and {record.test}; restore the capture or train again"
         )
     scene = with_refined_poses(run, resolved.recipe, scene)
-    scene = with_transients(run, with_learned_appearance(run, resolved.recipe, scene))
+    scene = with_maps(run, with_learned_appearance(run, resolved.recipe, scene))
     for name in resolved.recipe.quantities:
         if name not in QUANTITIES:
             on_event(Notice(f"{run.path} learned {name}, whose package is not installed: results differ without it"))

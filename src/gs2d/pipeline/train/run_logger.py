@@ -20,7 +20,7 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_images import draw_stage
 from gs2d.pipeline.finish.run_verdict import Collector
 from gs2d.pipeline.finish.scoring import mean_psnr, peak_memory, score_views, split_metrics
-from gs2d.pipeline.prepare.learned_views import write_appearance, write_poses, write_transients
+from gs2d.pipeline.prepare.learned_views import write_appearance, write_maps, write_poses
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun, Trained
 from gs2d.pipeline.prepare.predicted_views import predicted, with_predicted
@@ -287,7 +287,7 @@ class RunLogger:
             now = self._trainer.scene_now()
             write_poses(self._run, self._loaded.recipe, self._loaded.scene, now, self._on_event)
             write_appearance(self._run, now, self._on_event)
-            write_transients(self._run, now, self._on_event)
+            write_maps(self._run, now, self._on_event)
         write_splats(self._run.file(SPLATS), self._trainer.splats)
 
     def _attempted_at_end(self, index: int) -> AbstractContextManager[None]:

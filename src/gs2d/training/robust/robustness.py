@@ -16,7 +16,6 @@ from gs2d.config.recipe import DenseStart, Recipe, Removal, Stage
 from gs2d.core.camera import Camera
 from gs2d.core.image_arrays import enlarged
 from gs2d.core.splats import Splats
-from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.kernels.library import optional_library
@@ -28,7 +27,7 @@ from gs2d.training import events
 from gs2d.training.learned.learned_table import LearnedTable, shown
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.parallel import ONE_PROCESS, ProcessGroup
-from gs2d.training.robust import outlines, shine, transients
+from gs2d.training.robust import shine, transients
 from gs2d.training.robust.backdrop import in_color
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
 from gs2d.training.robust.large_splats import LARGEST, LARGEST_ANYWHERE, largest_log_scales, votes_against_unseen
@@ -217,8 +216,7 @@ class Robustness:
     def compare(self, state: TrainState, stage: Stage, iteration: int, *, shiny: bool) -> bool:
         """Compare the images with one another, if due, and return whether other pixels count from now on.
 
-        Detects what single images show and, with ``shiny``, shiny surface, whose splats move to its outlines; without
-        the native library all is matt.
+        Detects what single images show and, with ``shiny``, shiny surface; without the native library all is matt.
         """
         if not self._compares(stage, iteration):
             return False
@@ -233,11 +231,6 @@ class Robustness:
             state.maps["transient"] = decided(transients.CELLS, self._transients)
         if shiny:
             state.maps["shine"] = decided(shine.CELLS, self._shine)
-            if state.maps["shine"].any():
-                means = state.splats.means
-                self._backend.assign(
-                    means, self._processes.decide(lambda: self._to_outlines(state), means, means.dtype)
-                )
         now = state.maps.get("transient")
         return now is not None and bool(now.any() if before is None else (now != before).any())
 
@@ -272,18 +265,6 @@ class Robustness:
             return GreyImage(camera, self._images[row].grey[0, 0].numpy(), self._usable(state, row)), depth
 
         return shine.shine_maps(rendered, self._neighbours, library)
-
-    @torch.no_grad()
-    def _to_outlines(self, state: TrainState) -> Tensor:
-        """Return the centres [N, 3] of the splats after those on shiny surface have moved outward."""
-        splats, views = state.splats, []
-        mapped = [row for row, others in enumerate(self._neighbours) if others]  # the others have empty maps
-        for row in mapped[:: max(1, -(-len(mapped) // outlines.MOST_VIEWS))]:
-            camera, _, depth = self._rendered(state, row)
-            views.append(ViewCells(camera, state.maps["shine"][row].cpu().numpy() / 255.0, depth))
-        normals = quats_to_matrices(splats.quats)[:, :, 2]
-        moved = outlines.moved_outward(splats.means.cpu().numpy(), normals.cpu().numpy(), views)
-        return torch.from_numpy(moved).to(splats.means)
 
     def _usable(self, state: TrainState, row: int) -> np.ndarray:
         """Return the pixels of a downscaled image that count, bool [H, W]."""

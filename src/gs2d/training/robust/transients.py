@@ -64,10 +64,10 @@ def _transient(view: ViewCells, others: Sequence[ViewCells], least: float) -> np
     return found & (found.mean() <= MOST)
 
 
-def without_transients(scene: Scene, state: TrainState) -> Scene:
-    """Return the scene whose masks of training views leave out what single views show."""
-    maps = state.maps.get("transient")
-    if maps is None:
-        return scene
-    train = (view.without(cells) for view, cells in zip(scene.train, maps.cpu().numpy() > 0, strict=True))
-    return replace(scene, train=tuple(train))
+def with_maps(scene: Scene, state: TrainState) -> Scene:
+    """Return the scene with the maps of its training views, whose masks leave out what single views show."""
+    maps = {name: cells.cpu().numpy() for name, cells in state.maps.items()}
+    if "transient" in maps:
+        maps["transient"] = maps["transient"] > 0
+    rows = ({name: cells[row] for name, cells in maps.items()} for row in range(len(scene.train)))
+    return replace(scene, train=tuple(view.with_cells(**row) for view, row in zip(scene.train, rows, strict=True)))

@@ -15,10 +15,7 @@ HIDDEN = 0.05  # a surface is hidden in a view whose depth there is smaller by m
 
 @dataclass(frozen=True, eq=False)
 class ViewCells:
-    """A map of a view: camera, values [S, S], and depth in world units, 0 without a surface.
-
-    Depth has S x S cells too, but all pixels [H, W] for ``outlines``.
-    """
+    """A map of a view: camera, values [S, S], and depth [S, S] in world units, 0 without a surface."""
 
     camera: Camera
     values: np.ndarray
