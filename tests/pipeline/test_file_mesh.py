@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +14,19 @@ import trimesh
 from cli_runs import one_line
 from gs2d.cli import run
 from gs2d.core.splats import Splats
+from gs2d.data import Scene, load_scene
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import write_splats
 from gs2d.io.meshes import read_mesh
-from gs2d.pipeline.finish.run_mesh import mesh_file
+from gs2d.meshing.depth_maps import RenderedView
+from gs2d.pipeline.finish import run_mesh
+from gs2d.pipeline.finish.run_mesh import fused, mesh_file
 from gs2d.pipeline.finish.viewpoints import choose_viewpoints
 from gs2d.pipeline.look.page import settings_without_run
+from gs2d.pipeline.prepare.loaded import trained_elsewhere
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.backends import get_backend
+from gs2d.training.events import ignore
 from tiny import RADIUS, write_capture
 
 
@@ -130,6 +137,27 @@ def test_the_cameras_of_a_capture_are_used(tmp_path: Path, capsys: pytest.Captur
     assert run(words) == 0
     assert "viewpoints" not in capsys.readouterr().err
     assert np.median(np.linalg.norm(read_mesh(out).vertices, axis=1)) == pytest.approx(RADIUS, rel=0.1)
+
+
+def test_only_shiny_views_move_to_the_visual_hull(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(write_capture(tmp_path / "capture", size=48), test_every=0)
+    shiny = tuple(view.with_cells(shine=np.full((4, 4), 255, np.uint8)) for view in scene.train[:3])
+    maps: list[Sequence[np.ndarray | None]] = []
+
+    def nearer(frames: Iterable[RenderedView], shine: Sequence[np.ndarray | None]) -> Iterator[RenderedView]:
+        maps.append(shine)
+        return (replace(frame, depth=0.9 * frame.depth) for frame in frames)
+
+    def height(scene: Scene) -> float:
+        trained = trained_elsewhere(ball(), scene, "auto", "auto", ignore)
+        mesh = fused(trained, MeshOptions(voxel=0.06, refine=False), ignore).mesh
+        return float(np.median(np.linalg.norm(mesh.vertices, axis=1)))
+
+    monkeypatch.setattr(run_mesh, "to_visual_hull", nearer)
+    matt = height(scene)
+    assert not maps
+    assert height(replace(scene, train=(*shiny, *scene.train[3:]))) > 1.05 * matt
+    assert [cells is None for cells in maps[0]] == [False] * 3 + [True] * (len(scene.train) - 3)
 
 
 def test_a_glb_has_levels_of_detail_and_convex_pieces_beside_it(tmp_path: Path) -> None:

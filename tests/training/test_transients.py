@@ -13,7 +13,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.core.image_arrays import at_cells, enlarged
 from gs2d.data.scene import Scene, View
 from gs2d.errors import RunError
-from gs2d.io.run_dir import TRANSIENTS, RunFolder
+from gs2d.io.run_dir import SHINE, TRANSIENTS, RunFolder
 from gs2d.pipeline.prepare.learned_views import with_maps, write_maps
 from gs2d.training.events import Notice, TrainingEvent
 from gs2d.training.robust.transients import CELLS, transient_maps
@@ -107,21 +107,25 @@ def test_training_leaves_out_a_passer_by_and_resumes_with_that() -> None:
     resumed_everywhere(with_passer(wall()), robust(), "cpu", every=4)
 
 
-def test_the_masks_of_a_run_are_written_and_read(tmp_path: Path) -> None:
+def test_the_maps_of_a_run_are_written_and_read(tmp_path: Path) -> None:
     told: list[TrainingEvent] = []
     cells = np.zeros((CELLS, CELLS), bool)
     cells[BLOCK] = True
-    scene = wall()
-    marked = replace(scene, train=(scene.train[0], scene.train[1].with_cells(transient=cells), *scene.train[2:]))
+    scene, shine = wall(), np.arange(16, dtype=np.uint8).reshape(4, 4)
+    second = scene.train[1].with_cells(transient=cells, shine=shine)
+    marked = replace(scene, train=(scene.train[0], second, *scene.train[2:]))
     write_maps(RunFolder(tmp_path), marked, told.append)
     assert isinstance(told[0], Notice)
     assert "1 of 5 photographs" in told[0].text
     assert sorted(path.name for path in (tmp_path / TRANSIENTS).iterdir()) == ["1.png.png"]
     again = with_maps(RunFolder(tmp_path), scene)
     assert np.array_equal(again.train[1].transient, cells)
+    assert np.array_equal(again.train[1].shine, shine)
     assert again.train[0].mask() is None
+    assert again.train[0].shine is None
     write_maps(RunFolder(tmp_path), scene, told.append)  # a later training without any
     assert not (tmp_path / TRANSIENTS).exists()
+    assert not (tmp_path / SHINE).exists()
     assert with_maps(RunFolder(tmp_path), scene) is scene
 
 
