@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -20,11 +22,13 @@ SETTINGS = RasterSettings(background=(0.2, 0.5, 0.7), with_transmittance_depth=T
 KINDS = ("pinhole", "fisheye", "panorama")
 
 
-def everything(splats: Splats, camera: Camera, backend: Backend | str) -> dict[str, Tensor]:
+def everything(
+    splats: Splats, camera: Camera, backend: Backend | str, settings: RasterSettings = SETTINGS
+) -> dict[str, Tensor]:
     """Return all images, radii, gradients, splat errors and sums of pixels of one view, by name."""
     leaves = requiring_grad(splats)
     probe = torch.zeros(len(splats), 4, dtype=splats.dtype, requires_grad=True)
-    output = rasterize(leaves, camera, SETTINGS, backend=backend, screen_probe=probe)
+    output = rasterize(leaves, camera, settings, backend=backend, screen_probe=probe)
     names, generator = (*IMAGES, "depth_transmittance"), torch.Generator().manual_seed(3)
     images = {name: getattr(output, name) for name in names}
     given = [torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image) for image in images.values()]
@@ -33,16 +37,18 @@ def everything(splats: Splats, camera: Camera, backend: Backend | str) -> dict[s
     found |= {f"d_{name}": leaf.grad for name, leaf in leaves.items()}
     target = torch.rand(camera.height, camera.width, 8, generator=generator, dtype=torch.float64).to(splats.dtype)
     for occlusion in (False, True):
-        own = splat_errors(splats, camera, target[..., :3].contiguous(), SETTINGS, backend=backend, occlusion=occlusion)
+        own = splat_errors(splats, camera, target[..., :3].contiguous(), settings, backend=backend, occlusion=occlusion)
         found[f"errors_{occlusion}"] = own
-    found["sums"], _ = splat_sums(splats, camera, target, SETTINGS, backend=backend)
+    found["sums"], _ = splat_sums(splats, camera, target, settings, backend=backend)
     return {name: tensor for name, tensor in found.items() if tensor is not None}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_float64_build_equals_the_reference_to_rounding(native64: Library, kind: str) -> None:
+@pytest.mark.parametrize("mip_px", [0.0, 0.5])
+def test_the_float64_build_equals_the_reference_to_rounding(native64: Library, kind: str, mip_px: float) -> None:
     splats, camera = splats_around(0), ray_camera(kind)
-    expected, found = (everything(splats, camera, backend) for backend in ("reference", CpuBackend(native64)))
+    settings = replace(SETTINGS, mip_px=mip_px)
+    expected, found = (everything(splats, camera, backend, settings) for backend in ("reference", CpuBackend(native64)))
     assert expected.keys() == found.keys()
     assert expected["alpha"].mean() > 0.05
     for name, tensor in expected.items():

@@ -86,8 +86,8 @@ opacity o and colour c. A *pair* is a splat and a pixel. k^2 = 2 ln(o / alpha_mi
     with the same area in pixels. Pixels without a ray show the background. In 13, p moves along two axes at right
     angles to it, by 1/fx and 1/fy of the pinhole's Tu.z and Tv.z. In 14, the radius is the larger of sqrt(fx fy) times
     the chord of the angle of the sphere of radius k max(s_u, s_v) around p, and lowpass_px k, at most half the longer
-    side; 0 if that is outside the cone around all rays. There is no Mip filter (24), 19 is "draw", and fx, fy, cx and
-    cy have no other effect. On the reference backend rays have gradients.
+    side; 0 if that is outside the cone around all rays. In 24, sigma is mip_px / sqrt(fx fy) radians around each
+    centre. 19 is "draw", and fx, fy, cx and cy have no other effect. On the reference backend rays have gradients.
 """
 
 from __future__ import annotations
@@ -256,10 +256,10 @@ def _check_rays(splats: Splats, camera: Camera, settings: RasterSettings, backen
     away = (x * x + y * y + z * z - (density < MAX_DENSITY).to(x)).abs()  # of the squared length, 0 without a ray
     if not (rays.is_contiguous() and bool((away < 1e-3).all()) and bool((density > 0).all())):  # False for NaN
         raise ShapeError("Camera.rays must be contiguous and of unit length: make them with gs2d.render.rays.ray_map")
-    if settings.mip_px > 0 or settings.near_plane_policy != "draw" or camera.intrinsics is not None:
+    if settings.near_plane_policy != "draw" or camera.intrinsics is not None:
         raise ShapeError(
-            "a camera with rays has no Mip filter, no camera plane and no gradient of intrinsics: set mip_px=0, "
-            "near_plane_policy='draw' and intrinsics=None"
+            "a camera with rays has no camera plane and no gradient of intrinsics: set near_plane_policy='draw' and "
+            "intrinsics=None"
         )
 
 

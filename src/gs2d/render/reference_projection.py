@@ -131,29 +131,27 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
         color=color,
         normal=torch.where(away[:, None], -normal, normal),
     )
-    return _mip_filtered(screen, settings.mip_px) if settings.mip_px > 0 else screen
+    return _mip_filtered(screen, settings.mip_px, camera) if settings.mip_px > 0 else screen
 
 
-def _mip_filtered(screen: ScreenSplats, sigma: float) -> ScreenSplats:
+def _mip_filtered(screen: ScreenSplats, sigma: float, camera: Camera) -> ScreenSplats:
     """Apply the Mip filter of rule 24, ``sigma`` px (docs/math.md, "Mip filter")."""
-    # M (u, v) z_c is the pixel's offset from the projected centre, to first order.
-    (a, b), (c, d) = screen.Au[:, :2].unbind(dim=1), screen.Av[:, :2].unbind(dim=1)
-    s2 = (sigma * screen.Tw[:, 2] / (a * d - b * c)) ** 2  # inverse(M) inverse(M)^T = [[b^2 + d^2, ...]] / det(M)^2
-    g11, g12 = 1 + s2 * (b * b + d * d), -s2 * (a * b + c * d)
-    det = 1 + s2 * (a * a + b * b + c * c + d * d) + (sigma * screen.Tw[:, 2]) ** 2 * s2  # without cancellation
-    l11 = g11.sqrt()
-    l21, l22 = g12 / l11, det.sqrt() / l11
-
-    def widened(A: Tensor) -> Tensor:
-        return torch.stack([l11 * A[:, 0] + l21 * A[:, 1], l22 * A[:, 1], A[:, 2]], dim=1)
-
-    return replace(
-        screen,
-        Au=widened(screen.Au),
-        Av=widened(screen.Av),
-        Tw=widened(screen.Tw),
-        opacity=screen.opacity / (l11 * l22),
-    )
+    if camera.rays is None:
+        a, b, p = torch.stack([screen.Au, screen.Av, screen.Tw], dim=1).unbind(dim=2)
+    else:
+        a, b, p, sigma = screen.Au, screen.Av, screen.center, sigma / math.sqrt(camera.fx * camera.fy)
+    volume = (a * torch.linalg.cross(b, p)).sum(dim=1)
+    # To first order, (u, v) = z_c (row0, row1) . d for an offset d from the centre; both rows are at right angles to p.
+    row0, row1 = (torch.linalg.cross(*pair) / volume[:, None] for pair in ((b, p), (p, a)))
+    s2 = (sigma * screen.Tw[:, 2]) ** 2
+    uu, uv, vv = ((x * y).sum(dim=1) for x, y in ((row0, row0), (row0, row1), (row1, row1)))
+    det = 1 + s2 * (uu + vv) + (s2 * screen.Tw[:, 2] / volume) ** 2  # without cancellation: row0 x row1 = p / volume
+    l11 = (1 + s2 * uu).sqrt()
+    l21, l22 = s2 * uv / l11, det.sqrt() / l11
+    axes = {"Au": l11[:, None] * a + l21[:, None] * b, "Av": l22[:, None] * b}
+    if camera.rays is None:
+        axes = dict(zip(("Au", "Av", "Tw"), torch.stack([*axes.values(), p], dim=2).unbind(dim=1), strict=True))
+    return replace(screen, opacity=screen.opacity / (l11 * l22), **axes)
 
 
 def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:

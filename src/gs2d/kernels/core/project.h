@@ -33,6 +33,10 @@ template <class V> struct SplatParameters {
     V logit;
 };
 
+template <class V> struct Probe {  // the densification signal of rule 13
+    V x, y;
+};
+
 #if !GS2D_RAYS  // else core/rays.h has its own record
 // The screen record: 16 reals, one cache line in float. Field order is the memory order.
 template <class V> struct Record {

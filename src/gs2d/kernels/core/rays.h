@@ -53,6 +53,15 @@ GS2D_HD Record<V> project(const SplatParameters<V>& s, const Frame3<V>& f, const
     return r;
 }
 
+// The densification signal (rule 13) per half an image: the gradient of p moved at right angles to it.
+template <class V, class S>
+GS2D_HD Probe<V> probe_of(const Record<V>& r, const RecordGradient<V>& g, const PinholeCamera<S>& cam) {
+    const Vec3<V> gp = -dot(g.row0, r.row2) * r.row0 + -dot(g.row1, r.row2) * r.row1 + -dot(g.row2, r.row2) * r.row2;
+    const Perpendicular<V> e = perpendicular(r.direction);
+    const V distance = V(S(1)) / r.iz;
+    return {dot(gp, e.first) * (distance * V(S(1) / cam.fx)), dot(gp, e.second) * (distance * V(S(1) / cam.fy))};
+}
+
 // Vector-Jacobian product of `project`. `g_direction`, the gradient with respect to f.to_splat, comes from sh.h.
 template <class V, class S>
 GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Frame3<V>& f, const Record<V>& r,
@@ -63,10 +72,8 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
     };
     const Vec3<V> ga = column(f.row0), gb = column(f.row1);
     Vec3<V> gp = column(f.row2);
-    const Perpendicular<V> e = perpendicular(r.direction);
-    const V distance = V(S(1)) / r.iz;
-    out.probe_x = dot(gp, e.first) * (distance * V(S(1) / cam.fx));
-    out.probe_y = dot(gp, e.second) * (distance * V(S(1) / cam.fy));
+    const Probe<V> probe = probe_of(r, g, cam);
+    out.probe_x = probe.x, out.probe_y = probe.y;
     const V along = fma(r.iz, g.iz, dot(g.direction, r.direction));
     gp = axpy(r.iz, axpy(-along, r.direction, g.direction), gp);
     parameters_vjp(s, f, ga, gb, gp, {g.nx, g.ny, g.nz}, g.ln_opacity, g_direction, cam, out);

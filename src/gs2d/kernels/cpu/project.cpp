@@ -2,9 +2,8 @@
 #include "cpu/frame.h"
 #if GS2D_RAYS
 #include "cpu/ray_bounds.h"
-#else
-#include "core/mip_filter.h"
 #endif
+#include "core/mip_filter.h"
 #include "cpu/splat_group.h"
 #include "cpu/threads.h"
 
@@ -19,6 +18,15 @@ struct Group {
     M alive;
 };
 
+// The width of the Mip filter in the units of the records: px, of cameras with rays radians.
+inline V mip_sigma(const Frame& f) {
+#if GS2D_RAYS
+    return V(real(f.view.mip_px / sqrt(f.view.fx * f.view.fy)));
+#else
+    return V(real(f.view.mip_px));
+#endif
+}
+
 inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int lanes, bool opacity_counts) {
     Group g;
     g.parameters = load_parameters(s, i, lanes);
@@ -28,12 +36,12 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     g.alive = in_range(g.parameters, g.frame) & (g.record.iz * V(real(f.view.near)) < V(1)) & first(lanes);
 #else
     g.alive = in_range(g.parameters, g.frame) & (g.frame.p.z > V(real(f.view.near))) & first(lanes);
+#endif
     if (f.view.mip_px > 0) {
-        const MipFilter<V> filter = mip_filter(g.record, V(real(f.view.mip_px)));
+        const MipFilter<V> filter = mip_filter(g.record, mip_sigma(f));
         widen(filter, g.frame, g.record);
         g.alive = g.alive & filter.in_range();
     }
-#endif
     if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
     return g;
 }
@@ -238,10 +246,8 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
         const SplatParameters<V> p = load_parameters(s, i, lanes);
         const Frame3<V> frame = frame_of(p, f.camera);
         const Record<V> r = project(p, frame, f.camera);
-#if !GS2D_RAYS
         const bool filters = f.view.mip_px > 0;
-        const Probe<V> filtered = filters ? widen_vjp(r, V(real(f.view.mip_px)), gr) : Probe<V>{};
-#endif
+        const Probe<V> filtered = filters ? widen_vjp(r, mip_sigma(f), f.camera, gr) : Probe<V>{};
 
         V sh[3 * SH_MAX], basis[SH_MAX], along[SH_MAX];
         const int degree = f.view.sh_degree;
@@ -260,9 +266,7 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
 
         ParameterGradient<V> d =
             project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
-#if !GS2D_RAYS
         if (filters) d.probe_x = filtered.x, d.probe_y = filtered.y;
-#endif
         const auto write = [&]<int K>(real* to, V(&values)[K]) {
             if (!to) return;
             for (V& v : values) v = keep(seen, v);

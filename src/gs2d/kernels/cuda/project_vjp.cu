@@ -109,7 +109,7 @@ extern "C" __global__ void __launch_bounds__(128, PROJECT_VJP_BLOCKS) project_sp
         RecordGradient<float> gr = {g0.x, g0.y, g0.z, g0.w, g1.x, g1.y, g1.z, g1.w, g2.x, g2.y,
                                     g2.z, g2.w, g3.x, g3.y, g3.z, g3.w, e.x,  e.y,  e.z,  e.w};
         const bool filters = a.view.mip_px > 0.f;
-        const Probe<float> filtered = filters ? widen_vjp(r, a.view.mip_px, gr) : Probe<float>{};
+        const Probe<float> filtered = filters ? widen_vjp(r, a.view.mip_px, a.view.camera, gr) : Probe<float>{};
         d = project_vjp(p, frame, r, gr, g_direction, a.view.camera);
         if (filters) d.probe_x = filtered.x, d.probe_y = filtered.y;
         if (a.g_intrinsics) intrinsics = intrinsics_vjp(frame, r, gr, a.view.camera);
