@@ -50,11 +50,13 @@ LEVEL = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # x right, y down, z
 Rays = Callable[[np.ndarray, np.ndarray], np.ndarray]  # columns and rows, px -> rays of the camera; zeros: no ray
 
 
-def walls(seed: int = 0) -> np.ndarray:
-    """Return noise at several scales [6, CELLS, CELLS, 3] in [0, 255]."""
+def walls(seed: int = 0, finest: int = 128) -> np.ndarray:
+    """Return noise at several scales [6, CELLS, CELLS, 3] in [0, 255], of up to ``finest`` cells along a side."""
     rng = np.random.default_rng(seed)
     made = np.zeros((6, CELLS, CELLS, 3))
     for cells, weight in ((8, 1.0), (32, 1.2), (64, 1.0), (128, 0.7)):
+        if cells > finest:
+            break
         noise = rng.random((6, cells, cells, 3)).repeat(CELLS // cells, axis=1).repeat(CELLS // cells, axis=2)
         made += weight * noise
     return np.asarray(255 * (made - made.min()) / (made.max() - made.min()))
@@ -86,6 +88,16 @@ def colours(patterns: np.ndarray, eye: np.ndarray, rays: np.ndarray, boxes: np.n
     found = np.zeros(flat.shape)
     found[seen] = shown
     return found.reshape(rays.shape)
+
+
+def distances(eye: np.ndarray, rays: np.ndarray, boxes: np.ndarray = NO_BOXES) -> np.ndarray:
+    """Return how many times their length rays [P, 3] from inside the room reach [P]."""
+    nearest = ((np.where(rays > 0, HIGH, LOW) - eye) / rays).min(axis=1)
+    for low, high in boxes:
+        one, other = (low - eye) / rays, (high - eye) / rays
+        enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+        nearest = np.where((enter > 0) & (enter < leave) & (enter < nearest), enter, nearest)
+    return nearest
 
 
 def _painted(patterns: np.ndarray, which: np.ndarray, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -139,14 +151,19 @@ def fisheye_rays(
 
 
 def photograph(
-    patterns: np.ndarray, pose: np.ndarray, rays: Rays, size: tuple[int, int], boxes: np.ndarray = NO_BOXES
+    patterns: np.ndarray,
+    pose: np.ndarray,
+    rays: Rays,
+    size: tuple[int, int],
+    boxes: np.ndarray = NO_BOXES,
+    samples: int = 2,
 ) -> np.ndarray:
-    """Render uint8 [H, W, 3] from a pose T_cam_world [4, 4], with four rays per pixel."""
+    """Render uint8 [H, W, 3] from a pose T_cam_world [4, 4], with ``samples``^2 rays per pixel."""
     width, height = size
-    v, u = (np.mgrid[: height * 2, : width * 2] + 0.5) / 2
+    v, u = (np.mgrid[: height * samples, : width * samples] + 0.5) / samples
     eye = -pose[:3, :3].T @ pose[:3, 3]
     seen = colours(patterns, eye, rays(u, v) @ pose[:3, :3], boxes)
-    return np.rint(seen.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))).astype(np.uint8)
+    return np.rint(seen.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))).astype(np.uint8)
 
 
 def walk(count: int, *, tilt: float, turn: float, seed: int = 0) -> list[np.ndarray]:
@@ -174,6 +191,9 @@ def write_photographs(
     fits: str = "width",
     off: tuple[float, float] = (0.0, 0.0),
     tilt: float = 3.0,
+    finest: int = 128,
+    samples: int = 2,
+    subsampling: str = "4:2:0",
 ) -> dict[str, np.ndarray]:
     """Write ``000.jpg`` ... of a "panorama" or "fisheye" (4:3); return their poses.
 
@@ -184,11 +204,16 @@ def write_photographs(
     if kind == "fisheye":
         size, boxes = (width, 3 * width // 4), BOXES
         rays = fisheye_rays(*size, angle, circle=across(size, fits), off=off)
-    patterns, poses = walls(), walk(count, tilt=tilt, turn=180.0 if kind == "panorama" else 25.0)
+    patterns, poses = walls(finest=finest), walk(count, tilt=tilt, turn=180.0 if kind == "panorama" else 25.0)
     names = [f"{i:03}.jpg" for i in range(count)]
     for name, pose in zip(names, poses, strict=True):
-        image = Image.fromarray(photograph(patterns, pose, rays, size, boxes))
-        image.save(folder / name, quality=95, **({"xmp": whole_sphere(*size)} if kind == "panorama" else {}))
+        image = Image.fromarray(photograph(patterns, pose, rays, size, boxes, samples))
+        image.save(
+            folder / name,
+            quality=95,
+            subsampling=subsampling,
+            **({"xmp": whole_sphere(*size)} if kind == "panorama" else {}),
+        )
     return dict(zip(names, poses, strict=True))
 
 

@@ -94,7 +94,7 @@ INSIDE = {
         "actions densify robust": 3,
         "learned optimizer parallel rows": 2,
         "state": 1,
-        "events start step_result targets": 0,
+        "events photographs start step_result targets": 0,
     },
 }
 

@@ -76,7 +76,7 @@ def test_the_faces_of_a_panorama_equal_pinhole_images(tmp_path: Path) -> None:
         "9 equirectangular photographs are cut into 54 pinhole faces of 90 degrees, so that nothing is lost"
         in scene.notes
     )
-    assert all(view.is_face for view in scene.views)
+    assert all(view.whole is not None for view in scene.views)
     view = scene.train[0]
     assert (view.camera.width, view.camera.height, view.camera.fx) == (82, 82, 41.0)  # as fine as the panorama's middle
     assert all(view.valid() is None for view in scene.views)

@@ -105,7 +105,7 @@ def test_only_the_requested_intrinsics_are_learned(scene: Scene) -> None:
 
 
 def test_panorama_faces_keep_their_intrinsics(scene: Scene) -> None:
-    faces = replace(scene, train=tuple(replace(view, is_face=True) for view in scene.train))
+    faces = replace(scene, train=tuple(replace(view, whole=view) for view in scene.train))
     for views, stays in ((faces, True), (scene, False)):
         trainer = Trainer(views, quick(), GENERIC, backend="reference")
         trainer.run()

@@ -39,8 +39,8 @@ def enlarged(cells: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def at_cells(image: np.ndarray, cells: int) -> np.ndarray:
-    """Return the pixels [cells, cells] of an image [H, W] at the centres of the cells."""
-    rows, columns = (np.floor((np.arange(cells) + 0.5) / cells * side).astype(int) for side in image.shape)
+    """Return the pixels [cells, cells, ...] of an image [H, W, ...] at the centres of the cells."""
+    rows, columns = (np.floor((np.arange(cells) + 0.5) / cells * side).astype(int) for side in image.shape[:2])
     return np.asarray(image[rows[:, None], columns])
 
 

@@ -70,6 +70,7 @@ class PosedImage:
     # Pinhole face of a wide image. ``name`` and ``T_cam_world`` are those of the face, ``path`` and ``intrinsics``
     # those of the image.
     face: Face | None = None
+    undistorts: bool = True  # False: the image stays as in its file
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,7 @@ def decode(frame: PosedImage, downscale: int) -> DecodedImage:
             object_mask = object_mask & mask
         image, mask = cut_out(image, mask), None
     valid = None
-    if k.lens is not None:
+    if k.lens is not None and frame.undistorts:
         positions, inside = source_positions(k) if frame.face is None else face_positions(k, frame.face)
         image = wrapped(image, k)
         mask, object_mask = (None if a is None else wrapped(a, k) for a in (mask, object_mask))
@@ -206,13 +207,15 @@ def build_scene(
     cache = ImageCache(cache_bytes, spills=True)
     frames, mask_notes, masks = _with_masks(capture, root, masks)
     frames = sorted((fit_to_file(frame) for frame in frames), key=lambda frame: frame.name)
+    photographs = frames
     frames, cut = _cut(frames)
     names = [frame.name for frame in frames]
     if len(set(names)) != len(names):
         twice = next(a for a, b in itertools.pairwise(names) if a == b)
         raise DataError(f"{root} has several views named {twice}; names must be unique")
     frames, map_notes = (frames, ()) if cut else _with_maps(frames, capture.home or root)
-    views = [_view(frame, factor, cache) for frame in frames]
+    wholes = {each.path: _view(replace(each, undistorts=False, maps=None), factor, cache) for each in photographs}
+    views = [_view(frame, factor, cache, wholes[frame.path] if frame.face else None) for frame in frames]
     outliers = camera_outliers([view.camera for view in views])
     try:
         train, test = _split(frames, views, capture.default_test_every, test_every, root, set(outliers))
@@ -284,7 +287,7 @@ def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tupl
     return extent, (f"{what}: fine detail is lost; subtract an offset from the poses and points",)
 
 
-def _view(frame: PosedImage, factor: int, cache: ImageCache) -> View:
+def _view(frame: PosedImage, factor: int, cache: ImageCache, whole: View | None = None) -> View:
     k = frame.intrinsics
     if not all(_LENSES[0] <= f / side <= _LENSES[1] for f, side in ((k.fx, k.width), (k.fy, k.height))):
         raise DataError(
@@ -298,9 +301,8 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache) -> View:
     except ShapeError as error:
         raise DataError(f"view {frame.name}: {error}") from error
     maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera)
-    is_face = frame.face is not None
     read = functools.partial(decode, frame, factor)
-    return View(frame.name, camera, read, cache, frame.path, maps, ideal, is_face=is_face)
+    return View(frame.name, camera, read, cache, frame.path, maps, ideal, whole=whole)
 
 
 def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...]]:

@@ -44,7 +44,9 @@ class View:
     # (uint8) is 0 on matt surface, 255 on shiny surface.
     transient: np.ndarray | None = None
     shine: np.ndarray | None = None
-    is_face: bool = False  # whether it was cut out of a panorama or a wide fisheye (``data/faces.py``)
+    # The panorama or wide fisheye that it was cut out of (``data/faces.py``), as in its file: not undistorted, with the
+    # lens in ``intrinsics``. All faces of a photograph share it.
+    whole: View | None = field(default=None, repr=False)
 
     @classmethod
     def from_arrays(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from operator import getitem
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity, shown, shown_splats
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.robust.regularise import another_background, dropout_rate, dropped_out, rendered_splats
-from gs2d.training.state import TrainState
+from gs2d.training.state import Cells, TrainState
 from gs2d.training.step_result import StepResult
 from gs2d.training.targets import Target, TargetSource, is_async
 
@@ -70,6 +71,7 @@ class FullRender:
         self.learned = learned or LearnedTable(recipe, scene)
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
         self.frozen = frozen
+        self.cells: Cells = getitem  # returns the map of a view from those of ``TrainState.maps``
         self.targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
         self.losses = losses_of(recipe)
@@ -182,7 +184,7 @@ class FullRender:
             index=index,
             depth_kind=self.protocol.depth,
             silhouette=target.silhouette,
-            flatness=state.bare(index, target.flatness),
+            flatness=state.bare(index, target.flatness, self.cells),
             target_mean=target.mean,
         )
         resolved = self.protocol.resolve(stage.losses)

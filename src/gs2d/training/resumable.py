@@ -10,8 +10,8 @@ from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 
 
-def check_resumable(state: TrainState, recipe: Recipe, scene: Scene) -> None:
-    """Raise RunError unless training of a recipe on a scene can continue from a state."""
+def check_resumable(state: TrainState, recipe: Recipe, scene: Scene, views: int | None = None) -> None:
+    """Raise RunError unless training of a recipe on a scene, in epochs of ``views``, can continue from a state."""
     state.check()
     if state.splats.sh_degree != recipe.sh_degree:
         raise RunError(
@@ -19,11 +19,12 @@ def check_resumable(state: TrainState, recipe: Recipe, scene: Scene) -> None:
             f"{recipe.sh_degree}; start a new run"
         )
     _check_place(state, recipe)
-    last, views = max(state.queue, default=0), len(scene.train)
+    last, views = max(state.queue, default=0), len(scene.train) if views is None else views
     if last >= views:
         raise RunError(
             f"the checkpoint refers to training view {last}, but the scene has {views}; is it from another scene?"
         )
+    views = len(scene.train)
     for name, cells in state.maps.items():
         if len(cells) != views:
             raise RunError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from operator import getitem
 from typing import Any
 
 import torch
@@ -14,6 +15,8 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError, ShapeError
 
+Cells = Callable[[Tensor, int], Tensor]
+"""Returns the cells [S, S] of a trained view, by its index, from maps [V, S, S] of the training views of the scene."""
 FORMAT = 3  # of the state dict
 # Errors that reading a damaged state dict raises.
 _BROKEN = (LookupError, TypeError, AttributeError, RuntimeError, ValueError)
@@ -107,11 +110,11 @@ class TrainState:
     # [V, S, S] uint8, of cells of the training views: "shine" and "transient" (modules of ``training.robust``)
     maps: dict[str, Tensor] = field(default_factory=dict)
 
-    def bare(self, index: int, flatness: Tensor | None) -> Tensor | None:
+    def bare(self, index: int, flatness: Tensor | None, cells: Cells = getitem) -> Tensor | None:
         """Return where training view ``index`` has no texture to trust, [H, W] uint8: flat or shiny pixels."""
         if flatness is None or "shine" not in self.maps:
             return flatness
-        shine = F.interpolate(self.maps["shine"][index][None, None].float(), flatness.shape, mode="bilinear")
+        shine = F.interpolate(cells(self.maps["shine"], index)[None, None].float(), flatness.shape, mode="bilinear")
         return torch.maximum(flatness, shine[0, 0].to(torch.uint8))
 
     def trained_by(self, count: int) -> None:

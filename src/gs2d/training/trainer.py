@@ -41,6 +41,7 @@ from gs2d.training.objective import (
 )
 from gs2d.training.optimizer import adam_step, begin_stage, lr_at
 from gs2d.training.parallel import ONE_PROCESS, ProcessGroup, Turn
+from gs2d.training.photographs import TrainedViews, needs_faces
 from gs2d.training.resumable import check_resumable
 from gs2d.training.robust.regularise import is_opaque
 from gs2d.training.robust.robustness import Robustness, with_adjusted_cameras
@@ -157,8 +158,12 @@ class Trainer:
         self.scene = scene
         self.learned = LearnedTable(self.recipe, scene)
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes, self._frozen, sweep)
+        whole, like = not needs_faces(self.recipe, protocol, self.backend), torch.zeros((), dtype=options.dtype)
+        self._views = TrainedViews(scene.train, whole=whole, masks=protocol.use_mask_in_training, like=like)
+        self._compared = replace(scene, train=self._views.views)
+        self._learning = LearnedTable(self.recipe, self._compared)  # the same rows, by the views of iterations
         if state is not None:
-            check_resumable(state, self.recipe, scene)
+            check_resumable(state, self.recipe, scene, views=len(self._views.views))
         self.state = processes.share(lambda: self._first_state(init) if state is None else state)
         self.state.trained_by(processes.size)
         self.state.move_to(self.backend.device)
@@ -175,13 +180,15 @@ class Trainer:
         # Of the current stage, from its first iteration on:
         self._objective: FullRender | CachedViews | None = None
         self._whole_steps: WholeSteps | None = None
-        self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
+        views = self._views.views
+        self._ahead = ReadAhead(lambda index: views[index].image()) if scene.ahead else None
         needs = {need for _, loss in self._losses for need in loss.needs}
         self._needs_flatness = "flatness" in needs
         self._needs = needs | ({"silhouette"} if is_opaque(self.recipe) or self.learned.changes_color else set())
         self._whole = FullRender(
-            scene, self.recipe, protocol, self._learner, self._targets(), frozen=self._frozen, learned=self.learned
+            self._compared, self.recipe, protocol, self._learner, self._targets(), self._frozen, self._learning
         )
+        self._whole.cells = self._views.cells
 
     @property
     def splats(self) -> Splats:
@@ -203,7 +210,7 @@ class Trainer:
         return with_maps(self.learned.scene_now(self.state.learned), self.state)
 
     def _targets(self) -> TargetSource:
-        scene = with_maps(self.scene, self.state)
+        scene = with_maps(self._compared, self.state, self._views.cells)
         return make_targets(scene, self.protocol, self.backend, self.state.splats, self._needs)
 
     @property
@@ -262,7 +269,7 @@ class Trainer:
         stage, together = self.recipe.stages[state.stage], self.processes
         together.meet(state)
         iterations = self._iterations(stage)
-        turns = [Turn(number, state.next_view(len(self.scene.train))) for number in iterations]
+        turns = [Turn(number, state.next_view(len(self._views.views))) for number in iterations]
         iteration, self.views = iterations[-1], len(iterations)
         if self._ahead is not None:
             self._ahead.expect(together.part(state.queue[-self.scene.ahead * together.size :][::-1]))
@@ -339,7 +346,7 @@ class Trainer:
         for turn, gradients in zip(turns, of_views, strict=True):
             self._robust.decay(state, stage, turn.iteration, self._learner)
             learning = self.learned.learning(state.stage, turn.iteration)
-            self.learned.update(state.learned, turn.index, gradients, learning, self._learner)
+            self._learning.update(state.learned, turn.index, gradients, learning, self._learner)
         return result, happened
 
     def _rollback(self, stage: Stage, turns: Sequence[Turn]) -> None:
@@ -349,7 +356,7 @@ class Trainer:
                 self.state.moments[name].steps -= len(turns)
         for turn in turns:
             rates = self.learned.learning(self.state.stage, turn.iteration)
-            self.learned.rollback(self.state.learned, turn.index, rates)
+            self._learning.rollback(self.state.learned, turn.index, rates)
 
     def _check_shared(self) -> None:
         """Raise RecipeError for a densifier that several processes cannot share."""
@@ -376,7 +383,7 @@ class Trainer:
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """Yield the inner sum of E_i [N] for each training view of this process."""
-        for index in self.processes.part(range(len(self.scene.train))):
+        for index in self.processes.part(range(len(self._views.views))):
             errors = self._whole.errors(self.state, index, self.drawn, self.settings, occlusion=occlusion)
             yield errors[: len(self.state.splats)]
 

@@ -58,7 +58,7 @@ class WholeSteps:
             settings=self._settings_at(iteration, opaque=opaque),
             photograph=photograph.image,
             mask=photograph.mask,
-            flatness=state.bare(index, photograph.flatness),
+            flatness=state.bare(index, photograph.flatness, whole.cells),
             valid=photograph.valid,
             background=whole.protocol.background,
             losses=losses,

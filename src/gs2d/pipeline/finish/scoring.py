@@ -17,6 +17,7 @@ from gs2d.pipeline.prepare.learned_views import photographed
 from gs2d.pipeline.prepare.loaded import Trained
 from gs2d.render.types import RenderOutput
 from gs2d.training.events import OnEvent, counted
+from gs2d.training.photographs import TrainedViews
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,15 +47,20 @@ def score_views(
 ) -> dict[str, ImageMetrics]:
     """Return the image metrics of each view by its name; ``split`` is passed to the visitors.
 
-    Views are rendered with the appearance of their photographs, if learned. Masked pixels are ignored.
+    Views are rendered with the appearance of their photographs, if learned. Masked pixels are ignored. On backends that
+    render rays, test views that are faces are scored as whole photographs; visitors get the faces with these scores.
     """
-    renderings = _rendered(trained, views, split)
+    whole = split == "test" and trained.backend.takes_rays and trained.settings.near_plane_policy == "draw"
+    photographs = TrainedViews(views, whole=whole, masks=True, like=trained.splats.means).views
     scores: dict[str, ImageMetrics] = {}
-    for rendered in counted(renderings, f"scoring {split} views" if split else "scoring", len(views), on_event):
-        metrics = image_metrics(rendered.image, rendered.target, rendered.mask, backend=trained.backend, lpips=lpips)
-        scores[rendered.view.name] = metrics
-        for visit in visitors:
-            visit(rendered, metrics)
+    renderings = _rendered(trained, photographs, split)
+    for rendered in counted(renderings, f"scoring {split} views" if split else "scoring", len(photographs), on_event):
+        view, pair = rendered.view, (rendered.image, rendered.target, rendered.mask)
+        scores[view.name] = metrics = image_metrics(*pair, backend=trained.backend, lpips=lpips)
+        faces = [each for each in views if view.camera.rays is not None and each.path == view.path]
+        for shown in _rendered(trained, faces, split) if faces and visitors else (rendered,):
+            for visit in visitors:
+                visit(shown, metrics)
     return scores
 
 

@@ -27,6 +27,7 @@ from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_point
 from gs2d.pipeline.prepare.options import Training, TrainOptions, check_choices
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.point_gains import point_gains, spread
+from gs2d.training.photographs import needs_faces
 from gs2d.training.robust.backdrop import find_backdrop
 from gs2d.training.robust.robustness import check_free_space
 
@@ -145,6 +146,9 @@ def resolve(
     if len(scene.train) <= FEW_VIEWS and (slower := with_few_views(recipe)) != recipe:
         recipe = slower
         on_event(Notice(f"{len(scene.train)} training photographs: settings against overfitting", detail=True))
+    if any(view.whole is not None for view in scene.train):
+        why = needs_faces(recipe, protocol, capture.backend)
+        on_event(Notice(f"training uses {f'faces: {why}' if why else 'whole photographs'}", detail=True))
     return recipe, replace(capture, scene=scene, protocol=with_fused_depth(protocol, recipe))
 
 

@@ -47,7 +47,7 @@ class CameraIntrinsics(LearnedQuantity):
         The intrinsics of panorama faces are constant.
         """
         now = camera.zoomed(self.zoom(values, index))
-        if not learns or self.views[index].is_face:
+        if not learns or self.views[index].whole is not None:
             return now
         numbers = torch.tensor([now.fx, now.fy, now.cx, now.cy], dtype=torch.float64, requires_grad=True)
         return replace(now, intrinsics=numbers)

@@ -41,21 +41,22 @@ class ImageExposure(LearnedQuantity):
         """Return theta [V, 3, 4]: zeros, gains of sparse points, or previous transforms."""
         values = super().begin()
         if self._initial == "given":
-            if previous is None or len(previous) != len(values):
+            if previous is None or len(previous) != len(self.row_of):
                 raise RecipeError(
-                    f"learned.exposure.options.initial=given needs {len(values)} transforms, one per view, got "
+                    f"learned.exposure.options.initial=given needs {len(self.row_of)} transforms, one per view, got "
                     f"{0 if previous is None else len(previous)}; only `gs2d blocks` sets it, use points or identity"
                 )
-            return previous.detach().to(values) - identity(values)
+            values[self.row_of] = previous.detach().to(values) - identity(values)
+            return values
         gains = point_gains(self._scene) if self._initial == "points" else None
         if gains is not None:
             for channel in range(3):
-                values[:, channel, channel] = torch.as_tensor(gains[:, channel] - 1)
+                values[self.row_of, channel, channel] = torch.as_tensor(gains[:, channel] - 1)
         return values
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
         """Return the transform of a view [3, 4]."""
-        return identity(values) + (values[index] - (values.mean(dim=0) if self.learns else 0.0))
+        return identity(values) + (values[self.row_of[index]] - (values.mean(dim=0) if self.learns else 0.0))
 
     @staticmethod
     def apply(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:

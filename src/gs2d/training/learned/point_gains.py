@@ -20,20 +20,23 @@ MIN_TRACK = 3
 
 
 def point_gains(scene: Scene) -> np.ndarray | None:
-    """Return the gains of the training images and channels [V, 3]; their geometric mean over images is 1.
+    """Return the gains of the training images and channels [V, 3]; their geometric mean over photographs is 1.
 
     None if the capture does not say which points the images show.
     """
     observed = scene.observed(guessed=False)
     if observed is None:
         return None
+    photographs = {view: index for index, view in enumerate(dict.fromkeys(view.whole or view for view in scene.train))}
+    of_view = [photographs[view.whole or view] for view in scene.train]
     views, points, values = [], [], []
-    for index, view in enumerate(scene.train):
+    for index, view in zip(of_view, scene.train, strict=True):
         rows, colors = _colors(view, observed)
         views.append(np.full(len(rows), index))
         points.append(rows)
         values.append(np.log(colors))
-    return _fitted(np.concatenate(views), np.concatenate(points), np.concatenate(values), len(scene.train))
+    logs = np.concatenate(values)
+    return _fitted(np.concatenate(views), np.concatenate(points), logs, len(photographs))[of_view]
 
 
 def _colors(view: View, observed: ObservedPoints) -> tuple[np.ndarray, np.ndarray]:

@@ -60,7 +60,8 @@ class LearnedQuantity:
     shape : tuple of int
         Shape of a row.
     per_camera : bool
-        Whether images whose files have the same intrinsics share a row. False: each image has its own.
+        Whether images whose files have the same intrinsics share a row. False: each image has its own; faces of a
+        photograph share one if ``changes_color``.
     on_device : bool
         Whether the rows are stored beside the splats, so that a GPU need not wait. False: float64 in host memory.
     changes_color : bool
@@ -87,10 +88,10 @@ class LearnedQuantity:
     def __init__(self, settings: Quantity, scene: Scene) -> None:
         self.settings = settings
         self.views: Sequence[View] = scene.train
-        self.row_of = list(range(len(scene.train)))
-        if self.per_camera:
-            rows = {k: row for row, k in enumerate(dict.fromkeys(view.file_intrinsics() for view in scene.train))}
-            self.row_of = [rows[view.file_intrinsics()] for view in scene.train]
+        of_image = (view.whole or view if self.changes_color else view for view in scene.train)
+        keys = [view.file_intrinsics() for view in scene.train] if self.per_camera else list(of_image)
+        rows = {key: row for row, key in enumerate(dict.fromkeys(keys))}
+        self.row_of = [rows[key] for key in keys]
 
     @property
     def rows(self) -> int:

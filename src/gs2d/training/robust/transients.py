@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from operator import getitem
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.image_arrays import at_cells
 from gs2d.data.scene import Scene
 from gs2d.training.robust.view_cells import ViewCells, lower_median_elsewhere
-from gs2d.training.state import TrainState
+from gs2d.training.state import Cells, TrainState
 
 CELLS = 96  # a side of a map
 LEAST = 0.06  # of colours in [0, 1]; exposure that is not learned and highlights stay below
@@ -64,10 +65,11 @@ def _transient(view: ViewCells, others: Sequence[ViewCells], least: float) -> np
     return found & (found.mean() <= MOST)
 
 
-def with_maps(scene: Scene, state: TrainState) -> Scene:
+def with_maps(scene: Scene, state: TrainState, cells: Cells = getitem) -> Scene:
     """Return the scene with the maps of its training views, whose masks leave out what single views show."""
-    maps = {name: cells.cpu().numpy() for name, cells in state.maps.items()}
-    if "transient" in maps:
-        maps["transient"] = maps["transient"] > 0
-    rows = ({name: cells[row] for name, cells in maps.items()} for row in range(len(scene.train)))
-    return replace(scene, train=tuple(view.with_cells(**row) for view, row in zip(scene.train, rows, strict=True)))
+    maps = {name: values > 0 if name == "transient" else values for name, values in state.maps.items()}
+    train = (
+        view.with_cells(**{name: cells(values, row).cpu().numpy() for name, values in maps.items()})
+        for row, view in enumerate(scene.train)
+    )
+    return replace(scene, train=tuple(train))
