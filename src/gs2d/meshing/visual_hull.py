@@ -28,7 +28,8 @@ STEP, STEPS = 0.0025, 16  # fraction of the depth; what would have to move farth
 HALVINGS = 2  # of the last step
 REACH = 0.15  # of the depth: half the side of the window in which a surface must be convex; dents are smaller
 MOST_VIEWS = 48  # that are compared, evenly chosen
-COMPARED_SIDE, MOVED_SIDE = 800, 150  # px: shorter sides of the depth maps that are compared, and of those that move
+COMPARED_SIDE = 800  # px: most on the shorter side of the depth maps that are compared: 4 MB each
+MOVED_SIDE = 150  # px: least on the shorter side of the grid of pixels that move; those between move alike
 
 
 def to_visual_hull(frames: Iterable[RenderedView], shine: Sequence[np.ndarray | None]) -> Iterator[RenderedView]:
@@ -45,8 +46,8 @@ def to_visual_hull(frames: Iterable[RenderedView], shine: Sequence[np.ndarray | 
 
 
 def _compared(item: DepthMap) -> DepthMap:
-    """Return every so many pixels of a depth map, with their camera."""
-    step = max(1, min(item.depth.shape) // COMPARED_SIDE)
+    """Return a depth map at a shorter side of at most ``COMPARED_SIDE``, without interpolation."""
+    step = -(-min(item.depth.shape) // COMPARED_SIDE)
     camera, middle = item.camera.downscaled(step), step // 2
     depth = item.depth[middle::step, middle::step][: camera.height, : camera.width]
     return DepthMap(camera, np.ascontiguousarray(depth), None, None)

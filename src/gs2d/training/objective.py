@@ -67,11 +67,12 @@ class FullRender:
         targets: TargetSource,
         frozen: Splats | None = None,
         learned: LearnedTable | None = None,
+        cells: Cells = getitem,
     ) -> None:
         self.learned = learned or LearnedTable(recipe, scene)
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
         self.frozen = frozen
-        self.cells: Cells = getitem  # returns the map of a view from those of ``TrainState.maps``
+        self.cells = cells  # returns the map of a view from those of ``TrainState.maps``
         self.targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
         self.losses = losses_of(recipe)

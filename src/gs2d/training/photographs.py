@@ -37,8 +37,8 @@ def needs_faces(recipe: Recipe, protocol: Protocol, backend: Backend) -> str:
 class TrainedViews:
     """The ``views`` that iterations compare: those given, with whole photographs instead of faces if ``whole``.
 
-    ``masks``: whether training uses masks; pixels that are masked in
-    all photographs of a lens get no ray. ``like``: a tensor of the type of the splats.
+    ``masks``: whether training uses masks; pixels that are masked in all photographs of a lens get no ray. ``like``: a
+    tensor of the type of the splats.
     """
 
     def __init__(self, views: Sequence[View], *, whole: bool, masks: bool, like: Tensor) -> None:

@@ -186,9 +186,15 @@ class Trainer:
         self._needs_flatness = "flatness" in needs
         self._needs = needs | ({"silhouette"} if is_opaque(self.recipe) or self.learned.changes_color else set())
         self._whole = FullRender(
-            self._compared, self.recipe, protocol, self._learner, self._targets(), self._frozen, self._learning
+            self._compared,
+            self.recipe,
+            protocol,
+            self._learner,
+            self._targets(),
+            frozen=self._frozen,
+            learned=self._learning,
+            cells=self._views.cells,
         )
-        self._whole.cells = self._views.cells
 
     @property
     def splats(self) -> Splats:

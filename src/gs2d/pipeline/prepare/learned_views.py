@@ -112,7 +112,7 @@ def over(view: View, color: Tensor, background: tuple[float, float, float]) -> t
 
 # -- maps of photographs -----------------------------------------------------------------------------------------------
 def write_maps(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
-    """Write masks of what only one photograph shows, and maps of shiny surface, as COLMAP names masks; report masks."""
+    """Write transient masks and shine maps of the photographs, with the file names of COLMAP's masks; report masks."""
     for name in (TRANSIENTS, SHINE):
         shutil.rmtree(run.file(name), ignore_errors=True)
     for view in scene.train:
